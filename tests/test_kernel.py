@@ -81,9 +81,9 @@ def stepped(grasp):
 
     @jax.jit
     def run(fields, qpos, qvel, ctrl):
-        start = engine.place(engine.reset(fields), qpos, qvel)
+        start = engine.state_at(engine.reset(fields), qpos, qvel)
         outputs, new = engine.advance(world_constants(scene, fields), start, ctrl[:, None])
-        return engine.qvel(new), outputs["residual"].T
+        return engine.qvel(new), outputs["decrement"].T
 
     return run
 

@@ -133,6 +133,6 @@ def test_a_step_reads_nothing_that_it_has_not_written(monkeypatch):
     outputs, last = run(fields, ctrl[:, :5])
     distance = np.asarray(outputs["distance"])
     assert np.isfinite(distance).all() and (np.diff(distance, axis=1) != 0).all()
-    assert np.isfinite(outputs["residual"]).all() and np.isfinite(last.finger).all()
+    assert np.isfinite(outputs["decrement"]).all() and np.isfinite(last.finger).all()
     rows = held.rows(scene)["finger_finger"]
     assert np.abs(np.asarray(last.held[rows])).max() > 0  # some start with fingers in one another

@@ -105,7 +105,7 @@ class Case:
         @jax.jit
         def placed(fields, qvel):
             state = engine.reset(fields)
-            return engine.place(state, engine.qpos(state), qvel)
+            return engine.state_at(state, engine.qpos(state), qvel)
 
         fields = grasps.repeat(start.fields, 1)
         return grasps.lanes(scene, fields), placed(fields, start.qvel[None])

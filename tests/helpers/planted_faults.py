@@ -169,6 +169,6 @@ def simulate(scene, fields, state, ctrl, number, iterations=30):
     number = jnp.asarray(number, ctrl.dtype)[None]
     far = FAR + 0 * number
     hand = hand._replace(bounds=hand.bounds._replace(speed=far, penetration=DEEP + number))
-    start = engine.place(engine.reset(fields), *state)
+    start = engine.state_at(engine.reset(fields), *state)
     program = Program.here(scene, Limits(iterations, 40, 1e-24), np.float64)
     return program.simulate(hand, start, ctrl, trajectory=True, states=True)[0]

@@ -235,4 +235,4 @@ def loaded(fields, factor):
 
 def moving(engine: StructuredEngine, fields, qvel):
     """Start states of fields with velocities (world, nv)."""
-    return engine.place(engine.reset(fields), fields.start, qvel)
+    return engine.state_at(engine.reset(fields), fields.start, qvel)

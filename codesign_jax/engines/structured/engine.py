@@ -90,12 +90,17 @@ class StructuredEngine(Equal):
         """The states in which rollouts of model fields begin, leading axis (world,), in lanes."""
         return coordinates.reset(self.scene, fields)
 
-    def place(
+    def state_at(
         self, state: State, qpos: jax.Array, qvel: jax.Array, acc: jax.Array | None = None
     ) -> State:
-        """The state at MuJoCo's qpos (world, nq) and qvel (world, nv); see `coordinates.make`.
+        """The state at other coordinates, at the beginning of a grasp; contacts hold no friction.
 
-        The warm start is the given one or the state's own; contacts hold no friction yet.
+        Args:
+          state: A state, for its accelerations.
+          qpos: MuJoCo's positions, shape (world, nq).
+          qvel: MuJoCo's velocities, shape (world, nv).
+          acc: Accelerations, the solver's warm start, in the order of qvel, the object's as in
+            `kinematics.Acc`, shape (world, nv); None for those of the state.
         """
         warm = coordinates.flat_acc(state.acc) if acc is None else acc
         return coordinates.make(self.scene, qpos, qvel, warm)
@@ -269,7 +274,7 @@ class StructuredEngine(Equal):
         qpos = entries["qpos"] if trajectory else jnp.zeros(shape, series[0].dtype)
         # The decrement is a share of forces times accelerations, its root one of forces.  What a
         # step that converged leaves is rounding.
-        left = jnp.where(entries["residual"] > self.limits.tolerance, entries["residual"], 0.0)
+        left = jnp.where(entries["decrement"] > self.limits.tolerance, entries["decrement"], 0.0)
         return Trace(
             *series,
             qpos,
@@ -281,7 +286,7 @@ class StructuredEngine(Equal):
 
     def _status(self, series: dict[str, jax.Array]) -> jax.Array:
         """SOLVER_CAP above the tolerance, CONTACT_OVERFLOW; int32 of shape (world, time)."""
-        above = series["residual"] > self.limits.tolerance
+        above = series["decrement"] > self.limits.tolerance
         status = jnp.where(above, int(Status.SOLVER_CAP), 0).astype(jnp.int32)
         if "overflow" not in series:
             return status

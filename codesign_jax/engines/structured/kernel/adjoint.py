@@ -313,10 +313,10 @@ class BlockAdjoint:
         finger_bar = self.out.finger_start
         world_bar = self.out.world_start
         world = self.world
-        angles, places = self.tables.path_rows(states=False)
-        copy_rows((0, angles), lambda k: finger_bar[(k,)] + fingers[(t, k)], finger_bar)
+        of_finger, of_world = self.tables.path_rows(states=False)
+        copy_rows((0, of_finger), lambda k: finger_bar[(k,)] + fingers[(t, k)], finger_bar)
         copy_rows(
-            (0, places), lambda k: world_bar[k, world] + worlds[t, k, world], world_bar, world
+            (0, of_world), lambda k: world_bar[k, world] + worlds[t, k, world], world_bar, world
         )
 
     def _load(self, t: jax.Array, moved: jax.Array) -> None:

@@ -36,7 +36,8 @@ from codesign_jax.scene import Scene
 
 Arrays = TypeVar("Arrays")
 
-TRACE = ("distance", "height", "speed", "residual", "iterations", "moved")
+TRACE = ("distance", "height", "speed", "decrement", "iterations", "moved")
+"""Entries of the trace of a kernel; scenes with slots have "overflow" behind them."""
 
 
 WORLDS_THAT_WAIT = 2
@@ -199,11 +200,10 @@ class Program(Packing):
 
         path = []
         for part in path_parts(trajectory, states):
-            angles, places = self.path_rows(part.whole)
+            of_finger, of_world = self.path_rows(part.whole)
             count = -(-steps // part.stride)
-            path.append(
-                PathRows(shape(count, angles, self.columns), shape(count, places, self.block))
-            )
+            finger = shape(count, of_finger, self.columns)
+            path.append(PathRows(finger, shape(count, of_world, self.block)))
         some = self.record is not None and self.recorded.rows > 0
         recorded = shape(steps, self.recorded.rows, self.columns) if some else None
         outputs = Outputs(

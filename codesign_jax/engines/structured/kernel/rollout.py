@@ -139,7 +139,7 @@ class BlockRollout:
                 return verdict.goes_on(bounds, distance, height, fastest, now, to_end=to_end)
 
             self._store_path(t)
-            entry, new_speed, moved = step.advance(
+            entries, new_speed, moved = step.advance(
                 *self._command(t),
                 undecided=undecided,
                 waiting=going > 0,
@@ -149,8 +149,9 @@ class BlockRollout:
                 recorded=self._recorded(t),
             )
             going = jnp.where(moved, going, 0.0)
-            for k, value in enumerate((*entry[:2], fastest, *entry[2:4], going, *entry[4:])):
-                self.outputs.trace[t, k, self.world] = value
+            entries |= {"speed": fastest, "moved": going}
+            for k, name in enumerate(self.names):
+                self.outputs.trace[t, k, self.world] = entries[name]
             self._keep(step=now + 1.0, going=going, speed=new_speed)
             return t + 1, going
 
@@ -163,11 +164,11 @@ class BlockRollout:
     def repeat_last(self, done: jax.Array, steps: int) -> None:
         """Repeats the trace's last entries from step `done` on.
 
-        They are those of decided worlds of a block that goes on: no residual, and their speed.
+        They are those of decided worlds of a block that goes on: no decrement, and their speed.
         """
         last_speed = self._number(WorldState.speed)
         none = jnp.zeros_like(last_speed)
-        ended = {"speed": last_speed, "residual": none, "overflow": none}
+        ended = {"speed": last_speed, "decrement": none, "overflow": none}
         world = self.world
         trace = self.outputs.trace
 
@@ -194,9 +195,11 @@ class BlockRollout:
         return BoundTable(self.tables.recorded, TimeStep(recorded, t))
 
     def _number(self, name: str) -> jax.Array:
+        """A row of the worlds' state with one number, shape (lane,)."""
         return self.step.world_state.read(name).lane
 
     def _keep(self, **numbers: jax.Array) -> None:
+        """Stores such numbers, by row."""
         for name, value in numbers.items():
             self.step.world_state.write(name, lanes([value], (), wide=False))
 
@@ -214,10 +217,12 @@ class BlockRollout:
         """Stores the whole state, or its positions, at an index of the path."""
         outputs = self.outputs
         world = self.world
-        angles, places = self.tables.path_rows(whole)
+        of_finger, of_world = self.tables.path_rows(whole)
         at = (index,)
-        copy_rows((0, angles), lambda k: outputs.finger_state[(k,)], target.finger, at=at)
-        copy_rows((0, places), lambda k: outputs.world_state[k, world], target.world, world, at=at)
+        copy_rows((0, of_finger), lambda k: outputs.finger_state[(k,)], target.finger, at=at)
+        copy_rows(
+            (0, of_world), lambda k: outputs.world_state[k, world], target.world, world, at=at
+        )
 
 
 def _with_shared_columns(block: Block, inputs: Inputs, outputs: Outputs) -> tuple[Inputs, Outputs]:

@@ -50,7 +50,7 @@ class Step(StepMemory):
         limits: Limits,
         begins: Any,
         recorded: BoundTable | None = None,
-    ) -> tuple:
+    ) -> tuple[dict[str, jax.Array], jax.Array, jax.Array]:
         """Advances the block.
 
         Args:
@@ -64,8 +64,9 @@ class Step(StepMemory):
           recorded: Where the contacts' forces are written; None to record none.
 
         Returns:
-          Trace entries distance, height, residual, iterations and, with slots, overflow; speed
-          after the step; worlds that have moved, and so go on.
+          Entries of the trace, by name: distance and height before the step, decrement and
+          iterations of the solver and, with slots, overflow; the largest velocity after the step;
+          the worlds that have moved, and so go on.
         """
         layout = self.layout
         state, bodies, _, now, centre = self.assemble(arm, pressure)
@@ -79,15 +80,16 @@ class Step(StepMemory):
         distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
         height = state["position"][2].lane
         goes_on = waiting & undecided(distance, height)
-        slots = []
+        overflow = {}
         if layout.has_slots:
-            slots = [self._overflow(waiting)]
-            goes_on &= slots[0] == 0
+            overflow["overflow"] = self._overflow(waiting)
+            goes_on &= overflow["overflow"] == 0
         new_speed, good = semi_implicit_euler(self, state, bodies, now, goes_on, speed)
         count = jnp.full_like(height, convergence.count)
-        # Residuals of decided worlds are reported as 0; no iterations are spent on them.
-        residual = jnp.where(waiting, convergence.decrement.lane, 0.0)
-        return (distance, height, residual, count, *slots), new_speed, good
+        # Decrements of decided worlds are reported as 0; no iterations are spent on them.
+        decrement = jnp.where(waiting, convergence.decrement.lane, 0.0)
+        solved = {"decrement": decrement, "iterations": count}
+        return {"distance": distance, "height": height} | solved | overflow, new_speed, good
 
     def assemble(self, arm: Lanes, pressure: Lanes) -> tuple:
         """Reads the state, and leaves bodies, forces and contacts in the scratch table.

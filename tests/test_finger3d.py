@@ -4,14 +4,16 @@ The elements need NGSolve, which only `make finger3d` installs; without it their
 """
 
 import importlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from scripts.section import chain, hexahedra
+from scripts.section import chain, finger3d, hexahedra
 from scripts.section.elements import NoEquilibrium, Section
 from tests.helpers import exact_sections
 
+ROOT = Path(__file__).parents[1]
 G = 88e3
 PLAIN = {"thread_stiffness": 0.0, "fabric_stiffness": 0.0, "layers": 1, "sides": (4, 4, 4, 4)}
 """A section of rubber alone, with a coarse mesh."""
@@ -85,7 +87,60 @@ def test_tip_of_a_quarter_circle():
     assert chain.shear_stiffness(line, sheared, known) == pytest.approx(14.0, rel=1e-9)
 
 
-# --- elements, beside what the data show: slow and with NGSolve only ------------------------------
+# --- the law beside whole fingers -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return finger3d.all_beside(ROOT / finger3d.DATA)
+
+
+def under_pressure(rows):
+    return [s for states in rows.values() for s in states if s.pressure]
+
+
+def test_bends_beside_whole_fingers(rows):
+    """Of sections without ends, by elements and by the law, and the length that does not bend."""
+    assert len(rows) >= 6
+    for s in under_pressure(rows):
+        # What the end walls do decays along 80 mm; the middle still bends by up to 6 % more.
+        assert s.section == pytest.approx(s.middle, rel=0.07)
+        # The law errs by 7 % in the moment, and a free bend grows faster than that.
+        assert s.law == pytest.approx(s.middle, rel=0.15)
+        # A whole finger bends less than its chain.
+        assert 0.75 < s.angle / s.law < 0.96
+    for s in rows["long 5"][1:]:
+        # Its middle is a uniform finger; both have the same mesh across.
+        assert s.section == pytest.approx(s.middle, rel=0.01)
+    for name, states in rows.items():
+        shape = finger3d.fingers()[name]
+        # The chain's tip is where the finger's is, within 5 % of the length nonetheless.
+        assert all(s.tip < 0.05 * 1e3 * shape.length for s in states)
+        ends = 2e3 * shape.section.wall
+        # Both end walls, and up to 4 mm of the chamber beside them.
+        assert all(0.9 * ends < s.lost < ends + 4.0 for s in states if s.pressure)
+
+
+def test_tips_sideways_beside_whole_fingers(rows):
+    for states in rows.values():
+        empty, *inflated = states
+        # The law's sideways stiffness errs by 16 %, shear's formula for thin walls by a third.
+        assert empty.chain == pytest.approx(empty.across, rel=0.15)
+        for s in inflated:
+            # The chain bends over its end walls too; a short one is softer by what they hold.
+            assert 0.65 < s.chain / s.across < 1.1
+            assert s.rigid == pytest.approx(s.across, rel=0.25)
+            assert 0.6 < s.shear / s.law_shear < 1.8
+
+
+def test_two_meshes(rows):
+    """Half as many elements through the wall change angles and the tip's stiffness by 3 %."""
+    for coarse, fine in zip(rows["coarse 5"], rows["outside 5"], strict=True):
+        assert coarse.angle == pytest.approx(fine.angle, rel=0.03)
+        assert coarse.across == pytest.approx(fine.across, rel=0.03)
+
+
+# --- elements: slow, and with NGSolve only --------------------------------------------------------
 
 
 def rounded(solid, finger):

@@ -33,6 +33,8 @@ SKIN = 1e-3
 """Silicone over the thread of a finger with a skin [m]."""
 ELEMENT = 9e-3
 """Length of an element along the finger [m]."""
+DRAWN = ("outside 5", "long 5", "chamber 5")
+"""Fingers of the figure."""
 BENT = 1.0
 """Curvature sideways of a finger without pressure [1/m]: its fabric is strained by 1 %."""
 MIDDLE = 0.3
@@ -55,18 +57,21 @@ class Shape:
 
 def fingers() -> dict[str, Shape]:
     """The fingers by name."""
-    named = {}
-    for wall in (5e-3, 3.5e-3):
-        for name, depth in (("outside", 0.0), ("skin", SKIN / wall), ("chamber", 1.0)):
-            section = Section(wall=wall, thread_depth=round(depth, 6), sides=SIDES)
-            named[f"{name} {1e3 * wall:g}"] = Shape(section)
-    nominal = named["outside 5"].section
-    named["long 5"] = Shape(nominal, length=0.14)
-    named["wide 4"] = Shape(Section(width=30e-3, height=22e-3, wall=4e-3, sides=SIDES))
-    # The same finger with more elements tells the error of the mesh.
-    finer = dataclasses.replace(nominal, sides=(6, 4, 6, 4))
-    named["finer 5"] = Shape(finer, along=7e-3)
-    return named
+    nominal = Section(sides=SIDES)
+    share = SKIN / nominal.wall
+    coated = {n: getattr(nominal, n) + 2 * SKIN for n in ("width", "height")}
+    coated["wall"] = nominal.wall + SKIN
+    sections = {
+        "outside 5": nominal,
+        "skin 5": dataclasses.replace(nominal, thread_depth=share),
+        "chamber 5": dataclasses.replace(nominal, thread_depth=1.0),
+        "outside 3.5": dataclasses.replace(nominal, wall=3.5e-3),
+        "coated 5": dataclasses.replace(nominal, **coated, thread_depth=SKIN / coated["wall"]),
+        "wide 4": dataclasses.replace(nominal, width=30e-3, height=22e-3, wall=4e-3),
+        "coarse 5": dataclasses.replace(nominal, layers=1),
+    }
+    named = {name: Shape(section) for name, section in sections.items()}
+    return named | {"long 5": Shape(nominal, length=0.14)}
 
 
 # --- elements ----------------------------------------------------------------------------------
@@ -186,6 +191,7 @@ class Beside(NamedTuple):
     shortened: float  # the same of a chain with rigid end walls
     across: float  # force across the tip over its displacement
     chain: float  # the same of the chain
+    rigid: float  # the same of a chain with rigid end walls
     shear: float  # G A_s
     law_shear: float
     axis: float  # height over the fabric about which a force across turns the tip
@@ -218,7 +224,9 @@ def beside(content: Mapping[str, Any], state: Mapping[str, Any]) -> Beside:
     axis = height * (tip[0, 1] - turned(0.0)) / (turned(height) - turned(0.0))
     line = chain.arc(bend, length, height=height, end=end, axis=axis)
     rigid = chain.arc(law_bend, length, height=height, end=end)
-    shear = section_numbers.shear_area(height, section.wall, section.width)
+    area = section_numbers.shear_area(height, section.wall, section.width)
+    shear = section.shear_modulus * float(area)
+    ended = chain.tip_compliance(rigid, unsheared._replace(shear=shear))
     return Beside(
         pressure=1e-3 * pressure,
         angle=np.degrees(state["angle"]) / length / 10,
@@ -230,8 +238,9 @@ def beside(content: Mapping[str, Any], state: Mapping[str, Any]) -> Beside:
         shortened=1e3 * float(np.linalg.norm(rigid.tip - state["tip"])),
         across=1 / tip[0, 0],
         chain=1 / chain.tip_compliance(of_law, law)[0, 0],
+        rigid=1 / ended[0, 0],
         shear=chain.shear_stiffness(line, tip, sections),
-        law_shear=section.shear_modulus * float(shear),
+        law_shear=shear,
         axis=1e3 * axis,
         lateral=1e3 * chain.of_moments(line, tip, bend).lateral,
         section_lateral=1e3 * sections.lateral,
@@ -266,21 +275,41 @@ def sideways_table(rows: Mapping[str, Sequence[Beside]]) -> str:
     """What a small force and a small moment sideways do to the tip."""
     table = [
         [
-            *("finger", "kPa", "tip N/m", "chain N/m", "G·A_s N", "law N", "axis mm"),
+            *("finger", "kPa", "tip N/m", "chain N/m", "with rigid end walls N/m"),
+            *("G·A_s N", "law N", "axis mm"),
             *("EI by a moment mN m²", "section", "law"),
         ]
     ]
     for name, states in rows.items():
         for s in states:
-            tips = [f"{v:.0f}" for v in (s.across, s.chain)]
+            tips = [f"{v:.0f}" for v in (s.across, s.chain, s.rigid)]
             shears = [f"{v:.1f}" for v in (s.shear, s.law_shear, s.axis)]
             bends = [f"{v:.0f}" for v in (s.lateral, s.section_lateral, s.law_lateral)]
             table.append([name, f"{s.pressure:g}", *tips, *shears, *bends])
     return output.markdown(table)
 
 
+def draw(path: Path) -> Path:
+    """Curvature along fingers."""
+    named = json.loads(DATA.read_text(encoding="utf-8"))["fingers"]
+    figure = output.new_figure(8, 2.8)
+    axes = figure.subplots(1, len(PRESSURES))
+    for axis, pressure in zip(axes, PRESSURES, strict=True):
+        for name in DRAWN:
+            [state] = [s for s in named[name]["states"] if round(s["pressure"]) == pressure]
+            [line] = axis.plot(1e3 * np.array(state["places"]), state["bends"], label=name)
+            law = np.radians(10 * beside(named[name], state).law)
+            axis.axhline(law, color=line.get_color(), ls=":", lw=1)
+        axis.set_title(f"{1e-3 * pressure:g} kPa; dotted: law")
+        axis.set_xlabel("along the finger mm")
+    axes[0].set_ylabel("bend 1/m")
+    axes[0].legend()
+    return output.save_figure(figure, path)
+
+
 def fill(page: Path) -> None:
     rows = all_beside()
+    draw(page.parent.parent / "figures" / "finger3d.png")
     output.fill(page, bend_table(rows), "finger3d_bend")
     output.fill(page, sideways_table(rows), "finger3d_sideways")
 

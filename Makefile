@@ -67,7 +67,7 @@ test-browser: docs
 
 # Kernels of the default scene for GPUs by NVIDIA's assembler, without a GPU: a minute of one core.
 test-ptx: $(STAMP)
-	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k "assembler and not spheres"
+	$(BIN)/python -m pytest -q -rs -m slow tests/test_reverse.py -k "assembler and paper and not spheres"
 
 # Tests that need a GPU; GPU is the file that says how each ended.
 GPU ?= runs/gpu_suite.json

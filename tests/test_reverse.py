@@ -501,7 +501,7 @@ def assembler():
 
 @pytest.mark.slow  # .ci/run has that of the default scene
 @pytest.mark.skipif(assembler() is None, reason="ptxas, NVIDIA's assembler, is not installed")
-@pytest.mark.parametrize("name", ["paper", "paper_spheres"])
+@pytest.mark.parametrize("name", ["paper", "paper_spheres", "build"])
 def test_nvidias_assembler_takes_the_kernels(name, tmp_path):
     """Without a GPU: the driver's assembler is the same program. And it refuses another text."""
     for number, code in enumerate(ptx(scene.load(name))):

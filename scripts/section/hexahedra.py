@@ -6,9 +6,6 @@ import numpy as np
 
 from scripts.section.elements import Section, contours, rectangle
 
-SURFACES = ("base", "tip", "outside", "bottom", "chamber", "cap", "thread")
-"""Names of surfaces; `cap` is an end wall's face to the chamber, `thread` lies in the silicone."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Hexahedra:
@@ -20,7 +17,8 @@ class Hexahedra:
       nodes: Positions [m], shape (node, 3).
       elements: Nodes of each, four at its lower X and four at its higher one, shape (element, 8).
       surfaces: Nodes of quadrilaterals by name, counterclockwise about the normal that points out
-        of the silicone, shape (quadrilateral, 4).
+        of the silicone, shape (quadrilateral, 4): "base", "tip", "outside", "bottom", "chamber";
+        "cap" is the end walls' faces to the chamber, "thread" lies in the silicone.
       planes: Nodes of the outside at each X, from the bottom left, shape (plane, node).
     """
 
@@ -60,6 +58,19 @@ def _section_mesh(section: Section) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return nodes, ring[:-1], walls[:-1].reshape(-1, 4), chamber_quads
 
 
+def _extruded(flat: np.ndarray, slabs: np.ndarray, count: int) -> np.ndarray:
+    """Hexahedra on quadrilaterals, or quadrilaterals (a, b, b', a') on edges (a, b).
+
+    Args:
+      flat: Nodes of the section, shape (element, 4) or (element, 2).
+      slabs: Numbers of the parts along the finger.
+      count: Nodes of a section.
+    """
+    above = flat if flat.shape[1] == 4 else flat[:, ::-1]
+    start = count * slabs[:, None, None]
+    return np.concatenate([flat + start, above + start + count], -1).reshape(-1, 2 * flat.shape[1])
+
+
 def mesh(section: Section, length: float, end: float, along: int) -> Hexahedra:
     """A finger of this length.
 
@@ -73,44 +84,41 @@ def mesh(section: Section, length: float, end: float, along: int) -> Hexahedra:
     places = np.linspace(end, length - end, along + 1)
     if end:
         places = np.concatenate([[0.0, end / 2], places, [length - end / 2, length]])
-    first = 2 if end else 0
-    last = first + along
     count = len(flat)
-    slabs = len(places) - 1
-    along_x = np.repeat(places, count)[:, None]
-    nodes = np.concatenate([along_x, np.tile(flat, (slabs + 1, 1))], 1)
-
-    def extruded(quads: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Hexahedra on quadrilaterals, or quadrilaterals (a, b, b', a') on edges (a, b)."""
-        low = quads + count * which[:, None, None]
-        high = (quads if quads.shape[1] == 4 else quads[:, ::-1]) + count * (which + 1)[
-            :, None, None
-        ]
-        return np.concatenate([low, high], -1).reshape(-1, 2 * quads.shape[1])
-
-    every = np.arange(slabs)
-    hollow = np.arange(first, last)
+    every = np.arange(len(places) - 1)
+    hollow = (2 if end else 0) + np.arange(along)
     solid = np.setdiff1d(every, hollow)
-    hexahedra = np.concatenate([extruded(walls, every), extruded(filling, solid)])
+    across = np.tile(flat, (len(places), 1))
+    nodes = np.concatenate([np.repeat(places, count)[:, None], across], 1)
+    hexahedra = [_extruded(walls, every, count), _extruded(filling, solid, count)]
     edges = np.stack([ring, np.roll(ring, -1, 1)], -1)
+    bottom = section.sides[0]
     depth = int(np.abs(section.depths() - section.thread_depth).argmin())
+    # On the chamber's wall the thread lies in the silicone within the end walls only.
+    inside = solid if depth == len(ring) - 1 else every
     whole = np.concatenate([walls, filling]) if end else walls
+    caps = [filling + count * hollow[0], filling[:, ::-1] + count * (hollow[-1] + 1)]
     surfaces = {
         "base": whole[:, ::-1],
-        "tip": whole + count * slabs,
-        "outside": extruded(edges[0][section.sides[0] :], every),
-        "bottom": extruded(edges[0][: section.sides[0]], every),
-        "chamber": extruded(edges[-1][:, ::-1], hollow),
+        "tip": whole + count * len(every),
+        "outside": _extruded(edges[0][bottom:], every, count),
+        "bottom": _extruded(edges[0][:bottom], every, count),
+        "chamber": _extruded(edges[-1][:, ::-1], hollow, count),
     }
     if end:
-        faces = [filling + count * first, filling[:, ::-1] + count * last]
-        surfaces["cap"] = np.concatenate(faces)
-    if depth:
-        within = solid if depth == len(ring) - 1 else every
-        surfaces["thread"] = extruded(edges[depth], within)
-    used, number = np.unique(hexahedra, return_inverse=True)
+        surfaces["cap"] = np.concatenate(caps)
+    if depth and len(inside):
+        surfaces["thread"] = _extruded(edges[depth], inside, count)
+    planes = ring[0] + count * np.arange(len(places))[:, None]
+    return _without_unused(nodes, np.concatenate(hexahedra), surfaces, planes)
+
+
+def _without_unused(
+    nodes: np.ndarray, elements: np.ndarray, surfaces: dict[str, np.ndarray], planes: np.ndarray
+) -> Hexahedra:
+    """The mesh with the nodes that elements have."""
+    used, number = np.unique(elements, return_inverse=True)
     renamed = np.full(len(nodes), -1)
     renamed[used] = np.arange(len(used))
-    planes = renamed[ring[0] + count * np.arange(slabs + 1)[:, None]]
-    surfaces = {name: renamed[quads] for name, quads in surfaces.items() if len(quads)}
-    return Hexahedra(nodes[used], number.reshape(-1, 8), surfaces, planes)
+    named = {name: renamed[quads] for name, quads in surfaces.items()}
+    return Hexahedra(nodes[used], number.reshape(-1, 8), named, renamed[planes])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,16 @@ from codesign_jax.engines.structured.laws.kinematics import (
 from codesign_jax.engines.structured.laws.step_numbers import pushed
 from codesign_jax.model.layout import joint_axes
 from codesign_jax.scene import Scene
+
+
+class Assembly(NamedTuple):
+    """A step's problem, but for what is in the scratch table."""
+
+    state: dict[str, Lanes]  # Of wrist and object, by row of `rows.WorldState`
+    bodies: dict[str, Any]  # What `palm_and_object` returns
+    world_object: WorldObject  # The object of each lane's world
+    now: Iterate  # The warm start: accelerations of the last step
+    centre: Lanes  # The hand's centre from the object's [m], shape (3, 1, world)
 
 
 class Step(StepMemory):
@@ -91,16 +101,12 @@ class Step(StepMemory):
         solved = {"decrement": decrement, "iterations": count}
         return {"distance": distance, "height": height} | solved | overflow, new_speed, good
 
-    def assemble(self, arm: Lanes, pressure: Lanes) -> tuple:
+    def assemble(self, arm: Lanes, pressure: Lanes) -> Assembly:
         """Reads the state, and leaves bodies, forces and contacts in the scratch table.
 
         Args:
           arm: Commands of the arm frame [m, rad], shape (6, 1, world).
           pressure: Pressures of the chambers [Pa], lanes of a finger; with `air_mass` charges.
-
-        Returns:
-          The state of wrist and object by name, what `palm_and_object` finds, the objects, the warm
-          start, and the hand's centre from the object's.
         """
         layout = self.layout
         state = {name: self.world_state.read(name) for name in layout.world_state.groups}
@@ -111,7 +117,8 @@ class Step(StepMemory):
         if layout.grows:
             self.grow(pressure)
         self.bind_contacts()
-        return state, bodies, world_object, *self._forward(state, bodies, pressure, world_object)
+        now, centre = self._forward(state, bodies, pressure, world_object)
+        return Assembly(state, bodies, world_object, now, centre)
 
     def _keep_overlap(self, state: dict) -> None:
         """Keeps the largest overlap of two bodies of worlds whose grasp begins in this step.

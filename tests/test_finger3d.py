@@ -58,7 +58,8 @@ def test_opposite_sides_need_equal_numbers_of_elements():
 
 def test_tip_of_a_straight_chain():
     """Cantilever of Euler and Timoshenko, which twists by the lever of the force."""
-    length, height = 0.08, 0.02
+    length = 0.08
+    height = 0.02
     sections = chain.Sections(0.0, twist=3e-3, lateral=1e-2, shear=14.0)
     tip = chain.tip_compliance(chain.arc(0.0, length, height=height), sections)
     lever = height / 2
@@ -74,7 +75,8 @@ def test_tip_of_a_quarter_circle():
     """A force out of its plane, by Castigliano; and the sections again from the tip's rotations."""
     radius = 0.05
     length = radius * np.pi / 2
-    twist, lateral = 3e-3, 1e-2
+    twist = 3e-3
+    lateral = 1e-2
     line = chain.arc(1 / radius, length, height=0.0)
     np.testing.assert_allclose(line.tip, [radius, 0, -radius], atol=1e-6)
     tip = chain.tip_compliance(line, chain.Sections(1 / radius, twist, lateral))
@@ -168,7 +170,8 @@ def tube(solid, **options):
 @pytest.mark.slow
 def test_round_closed_tube(solid):
     """Free, by Lamé at a small pressure; and with an outside that cannot grow, at large ones."""
-    inner, outer = 6e-3, 10e-3
+    inner = 6e-3
+    outer = 10e-3
     finger, _kept = tube(solid, bulk_ratio=1e5)
     plane = finger.shape.planes[6]
     # End walls reach two diameters far with an amplitude of 1 %; here it passes through zero.

@@ -27,6 +27,7 @@ from codesign_jax.optimize.protocol import (
     check_start,
     check_told,
     episode_key,
+    first_memory,
     first_state,
     summarize,
 )
@@ -159,12 +160,8 @@ def _init(
     optimizer: Evolution, key: jax.Array, seed: jax.Array, num_particles: int
 ) -> OptimizerState:
     state = first_state(key, seed, num_particles)
-    memory = {
-        "mask": jnp.ones(seed.shape, bool),
-        "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
-        "strategy": arrays(optimizer.start(state)),
-    }
-    return state._replace(memory=memory)
+    strategy = arrays(optimizer.start(state))
+    return state._replace(memory=first_memory(state) | {"strategy": strategy})
 
 
 class Strategy(NamedTuple):

@@ -157,6 +157,15 @@ def first_state(key: jax.Array, seed_particle: jax.Array, num_particles: int) ->
     return OptimizerState(particles, jnp.zeros((), jnp.int32), key)
 
 
+def first_memory(state: OptimizerState) -> dict[str, jax.Array]:
+    """Memory of what was told to a new optimiser: every parameter is free, and no cost known."""
+    particles = state.particles
+    return {
+        "mask": jnp.ones(particles.shape[1:], bool),
+        "cost": jnp.full(len(particles), jnp.inf, particles.dtype),
+    }
+
+
 def _refuse_far(space: Space, particle: jax.Array) -> None:
     values = particle, space.low, space.high
     if any(isinstance(v, jax.core.Tracer) or np.ndim(v) != 1 for v in values):

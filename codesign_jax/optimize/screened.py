@@ -32,6 +32,7 @@ from codesign_jax.optimize.protocol import (
     check_start,
     check_told,
     episode_key,
+    first_memory,
     first_state,
     summarize,
 )
@@ -204,9 +205,5 @@ def _init(
     optimizer: Screened, key: jax.Array, seed: jax.Array, num_particles: int
 ) -> OptimizerState:
     state = first_state(key, seed, num_particles)
-    memory = {
-        "mask": jnp.ones(seed.shape, bool),
-        "cost": jnp.full(num_particles, jnp.inf, seed.dtype),
-        "way": state.particles,
-    }
-    return state._replace(memory=memory | optimizer.start(state))
+    memory = first_memory(state) | {"way": state.particles} | optimizer.start(state)
+    return state._replace(memory=memory)

@@ -3,7 +3,7 @@
 python -m scripts.experiments.fresh --experiments 23d --accuracies standard,reference
 python -m scripts.experiments.fresh --experiments 23d --objects household --label meshes   # adds
 python -m scripts.experiments.fresh --report --page docs/notes/results.md
-python -m scripts.experiments.fresh --data docs/data/experiments/elements --report --page ...
+python -m scripts.experiments.fresh --report --data docs/data/experiments/elements   # its tables
 
 An optimiser picks what the errors of its simulation favour (the winner's curse), so the order of
 the strategies is looked at once more: the particle of each run that tested best meets trials that

@@ -23,14 +23,20 @@ GOOD = {"length": 86, "height": 24.5, "wall": 5, "spread": 55, "arm_z": 58, "pre
 """A design of the paper's hand that holds all its objects, in the units of the hand's file."""
 
 
-@functools.cache
-def pinch(shape="box", links=3, *, hand=DATA / "pinch.toml", objects=None, **settings):
-    """Two opposed fingers and one object, or other files; settings as table__key=value."""
-    overrides = {"discretization": {"links": links}}
+def overrides_of(settings):
+    """Overrides of a scene by table, of settings as table__key=value."""
+    overrides = {}
     for key, value in settings.items():
         table, name = key.split("__")
         table = "hand.section" if table == "section" else table
         overrides.setdefault(table, {})[name] = list(value) if type(value) is tuple else value
+    return overrides
+
+
+@functools.cache
+def pinch(shape="box", links=3, *, hand=DATA / "pinch.toml", objects=None, **settings):
+    """Two opposed fingers and one object, or other files; settings as table__key=value."""
+    overrides = overrides_of({"discretization__links": links} | settings)
     files = {"hand_name": hand, "object_set": objects or DATA / f"{shape}.toml"}
     return scene.load("paper_spheres", **files, overrides=overrides)
 

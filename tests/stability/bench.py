@@ -63,11 +63,9 @@ def scene_of(name, hand_name=None, **settings) -> Scene:
     What is compared with MuJoCo C, that is `paper_spheres`, is solved as closely as C solves it;
     the default scene is solved as users have it.
     """
-    overrides: dict = {"newton": {"decrement": 1e-6}} if name == "paper_spheres" else {}
-    for key, value in settings.items():
-        table, entry = key.split("__")
-        overrides.setdefault(table, {})[entry] = value
-    return scene.load(name, hand_name=hand_name, overrides=overrides)
+    if name == "paper_spheres":
+        settings = {"newton__decrement": 1e-6} | settings
+    return scene.load(name, hand_name=hand_name, overrides=grasps.overrides_of(settings))
 
 
 @functools.cache

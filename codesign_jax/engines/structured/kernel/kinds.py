@@ -80,8 +80,9 @@ def above(origin, before, frame, numbers):
 
     Args:
       origin: Place of the joint.
-      before: Frame of the link before it; `frame`: of the link behind it.
-      numbers: Of the ring whose section the finger has there.
+      before: Frame of the link before the joint.
+      frame: Frame of the link behind it.
+      numbers: Numbers of the ring whose section the finger has there, shape (8, ...).
     """
     return origin + 0.5 * numbers[5] * (before[2] + frame[2])
 
@@ -90,7 +91,9 @@ def facing_line(numbers, frame, centre, other, t):
     """How rings face segments of a centre line, see `rings.facing_line`.
 
     Args:
-      numbers: The rings', shape (8, ...); `frame`: their links'; `centre`: their centres.
+      numbers: Numbers of the rings, shape (8, ...).
+      frame: Frames of their links, columns (3, 3, ...).
+      centre: Their centres [m], shape (3, ...).
       other: Ends and frames of the segments, a ring of their section, and 1 on last segments.
       t: Where on the segments their centres are nearest, see `rings.nearest`.
     """

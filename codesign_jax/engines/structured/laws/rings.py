@@ -51,7 +51,7 @@ def growth_factors(growth: jax.Array, pressure: jax.Array) -> jax.Array:
 
     Args:
       growth: How they grow, `section_growth.Growth`, shape (4, ...).
-      pressure: Of their chambers [Pa].
+      pressure: Gauge pressure of the sections' chambers [Pa].
     """
     of_section = section_growth.Growth(*jnp.unstack(growth))
     return jnp.stack(section_growth.factors(of_section, pressure))

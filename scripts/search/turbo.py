@@ -2,20 +2,24 @@
 
 python -m scripts.search.turbo --preset 23d --seeds 10 --out runs/search
 python -m scripts.search.turbo --preset 2d --budget 936 --particles 12 --tests 200 --out runs/search
+taskset -c 0,1 python -m scripts.search.turbo --equal-time --workers 1    # on two cores
 
 Needs `botorch`, which is no dependency of the project.  The method is that of Eriksson et al.
 (2019), "Scalable Global Optimization via Local Bayesian Optimization": a trust region around the
 best design so far, in which Thompson sampling proposes a batch; the region doubles after three
 batches that improve, halves after as many that do not as the space has parameters for each
 proposal (at least four), and starts anew once it is small.  Trials, final test and judging trials
-are those of `scripts.search` for random designs.
+are those of `scripts.search` for random designs.  With --equal-time the seeds run one after the
+other, each for as long as the default search takes on this machine, without compiling.
 """
 # pyright: reportMissingImports=false
 # BoTorch and PyTorch are no dependencies.
 
 import math
+import os
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -25,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from codesign_jax import codesign, use_compilation_cache
+from codesign_jax import codesign, optimize, use_compilation_cache
 from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
 from codesign_jax.judge.verdict import WANTED
@@ -41,6 +45,8 @@ SUCCESSES = 3
 that improve in a row until it doubles: Eriksson et al."""
 CANDIDATES = 2000
 """Points of the region among which Thompson sampling chooses."""
+DEFAULT_GRASPS = 4794
+"""Grasps of the default search, most of them at the accuracy `fast`."""
 
 
 class Region(NamedTuple):
@@ -78,7 +84,7 @@ class Region(NamedTuple):
 
 
 def propose(
-    units: np.ndarray, costs: np.ndarray, length: float, count: int, seed: int
+    units: np.ndarray, costs: np.ndarray, length: float, count: int, seed: int, threads: int
 ) -> np.ndarray:
     """A batch of a seed: Thompson samples in the region around the best design.
 
@@ -88,6 +94,7 @@ def propose(
       length: Side of the region.
       count: Proposals.
       seed: Seed of the candidates and samples.
+      threads: Threads of PyTorch.
     """
     import torch
     from botorch.fit import fit_gpytorch_mll
@@ -97,7 +104,7 @@ def propose(
     from gpytorch.mlls import ExactMarginalLogLikelihood
     from torch.quasirandom import SobolEngine
 
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads)
     torch.manual_seed(seed)
     places = torch.tensor(units, dtype=torch.double)
     gains = -torch.tensor(costs, dtype=torch.double)[:, None]
@@ -126,8 +133,10 @@ def propose(
 class Searches:
     """All seeds side by side: the simulations of a round are one batch."""
 
-    def __init__(self, study: Study, workers: int):
+    def __init__(self, study: Study, pool: ProcessPoolExecutor, threads: int):
         self.study = study
+        self.pool = pool
+        self.threads = threads
         space = study.space
         self.low = np.asarray(space.low)
         self.span = np.asarray(space.high) - self.low
@@ -136,7 +145,6 @@ class Searches:
         self.units: list[np.ndarray] = []
         self.costs: list[np.ndarray] = []
         self.regions = [Region()] * self.seeds
-        self.pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
 
     def round(self) -> None:
         """Proposes and simulates a batch of every seed."""
@@ -168,7 +176,8 @@ class Searches:
             units = np.concatenate([batch[seed] for batch in self.units[first:]])
             costs = np.concatenate([batch[seed] for batch in self.costs[first:]])
             mixed = 1000 * seed + number
-            jobs.append(self.pool.submit(propose, units, costs, region.length, particles, mixed))
+            batch = region.length, particles, mixed, self.threads
+            jobs.append(self.pool.submit(propose, units, costs, *batch))
         return [job if isinstance(job, np.ndarray) else job.result() for job in jobs]
 
     def recommend(self) -> np.ndarray:
@@ -184,12 +193,45 @@ class Searches:
         return finalists[np.arange(self.seeds), best]
 
 
+def seconds_of_default(make: Callable[..., Study]) -> float:
+    """Time of the default search's episodes and test, once its programs are compiled [s]."""
+    for seed in (0, 1):
+        study = make(optimize.DEFAULT, first=seed, seeds=1, at=[DEFAULT_GRASPS], coarse=True)
+        start = time.monotonic()
+        while not study.finished:
+            study.step()
+    return time.monotonic() - start
+
+
+def in_equal_time(
+    make: Callable[..., Study], name: str, seeds: int, pool: ProcessPoolExecutor, threads: int
+) -> tuple[list[Searches], float]:
+    """Searches of a seed each, for the default search's time, and that time [s].
+
+    Seed 0 runs once more at first: its programs are compiled and its worker has begun.
+    """
+    seconds = seconds_of_default(make)
+    searches = []
+    for seed in (0, *range(seeds)):
+        search = Searches(make(name, first=seed, seeds=1), pool, threads)
+        start = time.monotonic()
+        search.round()
+        # The first round of the first seed compiles.
+        start = start if searches else time.monotonic()
+        while time.monotonic() - start < seconds:
+            search.round()
+        print(f"seed {seed}: {len(search.units)} batches in {seconds:.1f} s", flush=True)
+        searches.append(search)
+    return searches[1:], seconds
+
+
 def main() -> int:
     parser = provenance.parser(__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs/search"), help="folder")
     parser.add_argument("--preset", default="23d")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--budget", type=int, default=2400, help="grasps of a seed, all counted")
+    parser.add_argument("--equal-time", action="store_true", help="the default search's time")
     parser.add_argument("--particles", type=int, default=24, help="designs of a batch")
     parser.add_argument("--tests", type=int, default=400, help="trials of a recommended design")
     parser.add_argument("--workers", type=int, default=10, help="processes that propose")
@@ -198,18 +240,19 @@ def main() -> int:
     start = time.monotonic()
     scene = scenes.load("paper")
     space = design_space(scene.hand, args.preset)
-    case = make_case(f"random:particles={args.particles},trials=3", space, args.preset)
-    sizes = {"seeds": args.seeds, "budget": args.budget, "tests": args.tests}
-    path = args.out / f"{args.preset}-turbo.npz"
-    study = Study(case, scene, make_engine("structured", scene), space, **sizes, path=path)
-    searches = Searches(study, args.workers)
-    rounds = (args.budget - study.tested) // case.worlds
-    for number in range(rounds):
-        searches.round()
-        least = [round(region.length, 3) for region in searches.regions]
-        print(f"batch {number + 1}/{rounds}, sides {least}", flush=True)
-    kept = study.judge(searches.recommend(), scene)
-    row = {
+    engine = make_engine("structured", scene)
+    name = f"random:particles={args.particles},trials=3"
+    path = args.out / f"{args.preset}-turbo{'-equal-time' if args.equal_time else ''}.npz"
+
+    def make(kind: str, *, coarse: bool = False, **sizes: Any) -> Study:
+        sizes = {"budget": args.budget, "tests": args.tests} | sizes
+        searched = scenes.with_accuracy(scene, "fast") if coarse else None
+        case = make_case(kind, space, args.preset)
+        return Study(case, scene, engine, space, **sizes, path=path, searched=searched)
+
+    pool = ProcessPoolExecutor(args.workers, mp_context=get_context("spawn"))
+    threads = max(1, len(os.sched_getaffinity(0)) // args.workers)
+    row: dict[str, Any] = {
         "preset": args.preset,
         "scene": "paper",
         "objects": None,
@@ -218,11 +261,24 @@ def main() -> int:
         "optimizer": f"turbo:particles={args.particles},trials=3",
         "particles": args.particles,
         "trials": 3,
-        "grasps": [rounds * case.worlds + study.tested],
-        "kept": [np.round(kept, 4).tolist()],
-        "seconds": round(time.monotonic() - start),
-        "provenance": provenance.results(args.commit),
     }
+    if args.equal_time:
+        searches, row["seconds_of_a_seed"] = in_equal_time(make, name, args.seeds, pool, threads)
+        row["changes"] = ["equal time"]
+    else:
+        search = Searches(make(name, seeds=args.seeds), pool, threads)
+        rounds = (args.budget - search.study.tested) // search.study.case.worlds
+        for number in range(rounds):
+            search.round()
+            least = [round(region.length, 3) for region in search.regions]
+            print(f"batch {number + 1}/{rounds}, sides {least}", flush=True)
+        searches = [search]
+    kept = np.concatenate([s.study.judge(s.recommend(), scene) for s in searches])
+    grasps = [len(s.units) * s.study.case.worlds + s.study.tested for s in searches]
+    row["grasps"] = [int(np.median(grasps))]
+    row["kept"] = [np.round(kept, 4).tolist()]
+    row["seconds"] = round(time.monotonic() - start)
+    row["provenance"] = provenance.results(args.commit)
     output.write_json(path.with_suffix(".json"), row)
     print(f"{np.mean(kept):.3f} kept, {np.mean(kept >= WANTED):.2f} of the seeds keep 95 %")
     return 0

@@ -19,6 +19,7 @@ import pytest
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.forces import forces
 from codesign_jax.engines.structured.kernel import memory_tables
+from codesign_jax.engines.structured.kernel.placement import at
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotCounts
@@ -119,15 +120,15 @@ def added(*fields):
 
 
 def first_only(right, mine, self, row, which, fields, lane):
-    right(self, row, which & ~(mine & (self.read("count", row).lane > 0)), fields, lane)
+    right(self, row, which & ~(mine & (self.read("count", at(row)).lane > 0)), fields, lane)
 
 
 def not_emptied(right, mine, self, row):
     """The first slot stays as it was in the step before."""
-    before = self.read("count", row).lane
+    before = self.read("count", at(row)).lane
     right(self, row)
     kept = jnp.where(mine, jnp.minimum(before, 1.0), 0.0).astype(before.dtype)
-    self.write("count", lanes([kept], (), wide=True), row)
+    self.write("count", lanes([kept], (), wide=True), at(row))
 
 
 def no_flag(right, mine, self):

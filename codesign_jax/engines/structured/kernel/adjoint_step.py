@@ -20,6 +20,7 @@ from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, o
 from codesign_jax.engines.structured.kernel.coupling import Coupling
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
+from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.residual import Before, LinkMotion
 from codesign_jax.engines.structured.kernel.residual_vjp import ResidualVjp
@@ -233,7 +234,7 @@ class AdjointSolve(Elimination):
         smooth, right = self.problem.read(Scratch.smooth, Virtual.acc_bar, item=i)
         return [_none(smooth), right]
 
-    def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+    def of_contacts(self, contacts: BoundContacts, item: Item, alpha: Lanes) -> tuple[Lanes, Lanes]:
         matrix, wrench = contacts.inertia_and_wrench(item, alpha)
         if contacts.set.holds:
             return matrix, friction_memory.wrench_of_cotangents(self.problem, contacts, item)
@@ -253,7 +254,7 @@ class AdjointSolve(Elimination):
         problem = self.problem
         size = self.block.size
         no_step = zeros((), self.like)
-        node, work = self.backward(no_step)
+        node, work = self.backward(no_step, problem.self_contacts)
         palm = problem.palm
         none = Iterate(*(_none(v) for v in (palm.smooth_wrist, *[palm.smooth_object] * 2)))
         step, done = self.at_palm(none, node, self.of_dealt_contacts(no_step))

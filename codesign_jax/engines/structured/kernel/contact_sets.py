@@ -22,6 +22,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     tree_add_scaled,
     upper,
 )
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.rows import Contact, Group, Rows
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -132,14 +133,25 @@ class BoundContacts:
         self.cone = cone
         self.like = jnp.zeros((of.size,), table.dtype)
 
-    def read(self, field: str, item: Any) -> Lanes:
+    def read(self, field: str, item: Item) -> Lanes:
         """A field of the item's contacts, shape (component, k, finger, world)."""
-        return self.table.read(f"{self.set.name}.{field}", item)
+        name = f"{self.set.name}.{field}"
+        if not jnp.ndim(item.source):
+            return self.table.read(name, item.source)
+        return self.table.gather(name, item.source, self._lane())
 
-    def write(self, field: str, value: Lanes, item: Any) -> None:
-        self.table.write(f"{self.set.name}.{field}", value, item)
+    def write(self, field: str, value: Lanes, item: Item) -> None:
+        """Stores a field of the item's contacts."""
+        name = f"{self.set.name}.{field}"
+        if not jnp.ndim(item.sink):
+            self.table.write(name, value, item.sink)
+        else:
+            self.table.scatter(name, value, item.sink, self._lane())
 
-    def touching(self, item: Any) -> jax.Array:
+    def _lane(self) -> jax.Array:
+        return jax.lax.broadcasted_iota(jnp.int32, (self.set.size,), 0)
+
+    def touching(self, item: Item) -> jax.Array:
         """Whether any lane's contact is active, a scalar."""
         shares = self.read(Contact.share, item).parts.ravel()
         mask = shares[0] > 0
@@ -147,7 +159,7 @@ class BoundContacts:
             mask = mask | (share > 0)
         return anywhere(mask)
 
-    def if_touching(self, item: Any, compute: Callable, parts: list[tuple]) -> list[Lanes]:
+    def if_touching(self, item: Item, compute: Callable, parts: list[tuple]) -> list[Lanes]:
         """compute() where a lane touches, zeros of wide shapes elsewhere."""
         empty = [zeros(shape, self.like) for shape in parts]
         none, rebuild = solid(empty, self.set.size)
@@ -157,14 +169,17 @@ class BoundContacts:
 
         return rebuild(jax.lax.cond(self.touching(item), some, lambda: none))
 
-    def cone_at(self, item: Any) -> Cone:
+    def cone_at(self, item: Item) -> Cone:
+        """The cone of the item's contacts."""
+        if item.cone is not None:
+            return item.cone
         if not self.set.friction_by_contact:
             return self.cone
         return lanewise(Cone.of_friction, self.cone, self.read(Contact.friction, item)[0])
 
     def create(
         self,
-        item: Any,
+        item: Item,
         place: Place,
         acc: Lanes,
         vel: Lanes,
@@ -196,37 +211,38 @@ class BoundContacts:
         else:
             jax.lax.cond(self.touching(item), store, lambda: None)
 
-    def begin(self, item: Any, place: Place, acc: Lanes, vel: Lanes) -> tuple[Place, Lanes]:
+    def begin(self, item: Item, place: Place, acc: Lanes, vel: Lanes) -> tuple[Place, Lanes]:
         """Places whose share is zero where no candidate is, and their jar."""
         run = partial(as_candidates, margin(self.set.scene))
         return lanewise(run, place, self.cone_at(item), acc, vel)
 
-    def each_item(self, body: Callable[[Any], None]) -> None:
+    def each_item(self, body: Callable[[Item], None]) -> None:
         """Runs body(item), which stores something, for all items."""
 
-        def step(item: jax.Array, x: jax.Array) -> jax.Array:
-            body(item)
+        def step(number: jax.Array, x: jax.Array) -> jax.Array:
+            body(at(number))
             return x
 
         jax.lax.fori_loop(0, self.set.count, step, jnp.int32(0))
 
     def fold_items(self, body: Callable, start: Any) -> Any:
         """Folds body(item, tree of lanes) over all items."""
-        return loop(self.set.count, body, start, self.set.size)
+        fold = lambda number, carry: body(at(number), carry)  # noqa: E731
+        return loop(self.set.count, fold, start, self.set.size)
 
-    def place(self, item: Any) -> Place:
+    def place(self, item: Item) -> Place:
         return Place(*(self.read(field, item) for field in Place._fields))
 
     def deepest(self) -> Lanes:
         """The largest depth of the lanes' contacts [m], zero where nothing overlaps."""
         return self.fold_items(self._deeper, zeros((), self.like))
 
-    def _deeper(self, item: Any, depth: Lanes) -> Lanes:
+    def _deeper(self, item: Item, depth: Lanes) -> Lanes:
         return lanewise(
             _deeper, depth, self.read(Contact.share, item), self.read(Contact.gap, item)
         )
 
-    def inertia_and_wrench(self, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+    def inertia_and_wrench(self, item: Item, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Adds the last step to jar; returns the contacts' inertia (6, 6) and wrench (6,) there."""
         parts: list[tuple] = [(21,), (6,)]
         triangle, wrench = self.if_touching(
@@ -234,7 +250,7 @@ class BoundContacts:
         )
         return full(triangle), wrench
 
-    def _inertia_and_wrench(self, item: Any, alpha: Lanes) -> list[Lanes]:
+    def _inertia_and_wrench(self, item: Item, alpha: Lanes) -> list[Lanes]:
         # All is read before anything is stored, see `self_contacts.OwnSide`.
         jar = self.read(Contact.jar, item)
         step = self.read(Contact.step, item)
@@ -244,11 +260,11 @@ class BoundContacts:
         matrix, wrench = lanewise(inertia_and_wrench, place, self.cone_at(item), jar)
         return [upper(matrix), wrench]
 
-    def wrench(self, item: Any, alpha: Lanes) -> Lanes:
+    def wrench(self, item: Item, alpha: Lanes) -> Lanes:
         """Wrench (6,) of the item's contacts where the last step has moved jar, which is kept."""
         return self.if_touching(item, lambda: [self._wrench(item, alpha)], [(6,)])[0]
 
-    def _wrench(self, item: Any, alpha: Lanes) -> Lanes:
+    def _wrench(self, item: Item, alpha: Lanes) -> Lanes:
         contacts = self.set.contacts
 
         def response(place, cone, alpha, jar, step):
@@ -260,11 +276,11 @@ class BoundContacts:
         step = self.read(Contact.step, item)
         return lanewise(response, self.place(item), self.cone_at(item), alpha, jar, step)
 
-    def changes(self, item: Any, alpha: Lanes) -> Lanes:
+    def changes(self, item: Item, alpha: Lanes) -> Lanes:
         """How many of the item's contacts the last step takes to another zone of the cone."""
         return self.if_touching(item, lambda: [self._changes(item, alpha)], [()])[0]
 
-    def _changes(self, item: Any, alpha: Lanes) -> Lanes:
+    def _changes(self, item: Item, alpha: Lanes) -> Lanes:
         of_line = self.set.of_line
 
         def count(share, cone, ray, alpha):
@@ -276,14 +292,14 @@ class BoundContacts:
         cone = self.cone_at(item)
         return lanewise(count, share, cone, self.read(Contact.ray, item), alpha)
 
-    def prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
+    def prepare_linesearch(self, item: Item, step: Lanes) -> Lanes:
         """Stores the cost along a step (6, ...) of the acceleration; returns its slope at 0."""
         return self.if_touching(item, lambda: [self._prepare_linesearch(item, step)], [()])[0]
 
-    def _prepare_linesearch(self, item: Any, step: Lanes) -> Lanes:
+    def _prepare_linesearch(self, item: Item, step: Lanes) -> Lanes:
         return self.line(item, self.relative_acceleration(item, step))
 
-    def relative_acceleration(self, item: Any, acc: Lanes) -> Lanes:
+    def relative_acceleration(self, item: Item, acc: Lanes) -> Lanes:
         """Accelerations (3, k) of contact points in their axes, by that of the bodies (6, ...)."""
         contacts = self.set.contacts
 
@@ -292,12 +308,12 @@ class BoundContacts:
 
         return lanewise(relative, self.place(item), self.cone_at(item), acc)
 
-    def record(self, table: BoundTable, name: str, value: Lanes, item: Any) -> None:
+    def record(self, table: BoundTable, name: str, value: Lanes, item: Item) -> None:
         """Writes a field of `rows.TouchForce` of an item's contacts, (..., k)."""
         for j in range(self.set.k):
-            table.write(name, value[..., j, :, :], item * self.set.k + j)
+            table.write(name, value[..., j, :, :], item.number * self.set.k + j)
 
-    def line(self, item: Any, change: Lanes) -> Lanes:
+    def line(self, item: Item, change: Lanes) -> Lanes:
         """Stores the contacts' cost along a change of jar; returns its slope at 0."""
         given = self.place(item), self.cone_at(item), self.read(Contact.jar, item), change
         line, slope = lanewise(cost_along_line, *given)
@@ -305,11 +321,11 @@ class BoundContacts:
         self.write(Contact.ray, line, item)
         return slope
 
-    def slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
+    def slopes(self, item: Item, alpha: Lanes) -> list[Lanes]:
         """First and second derivative of the item's cost by the step length, at alpha."""
         return self.if_touching(item, lambda: self._slopes(item, alpha), [(), ()])
 
-    def _slopes(self, item: Any, alpha: Lanes) -> list[Lanes]:
+    def _slopes(self, item: Item, alpha: Lanes) -> list[Lanes]:
         share = self.read(Contact.share, item)
         cone = self.cone_at(item)
         return lanewise(slopes_along_line, share, cone, self.read(Contact.ray, item), alpha)

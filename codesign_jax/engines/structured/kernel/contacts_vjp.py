@@ -17,6 +17,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, z
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.kinds import KINDS, BodyMotion, CentreLine
 from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate
 from codesign_jax.engines.structured.kernel.rows import (
     BodyBar,
@@ -32,7 +33,7 @@ from codesign_jax.engines.structured.kernel.rows import (
 )
 from codesign_jax.engines.structured.kernel.self_collision import neighbours
 from codesign_jax.engines.structured.kernel.self_contacts import FingerPairing
-from codesign_jax.engines.structured.kernel.slots import UsedSlot, any_of
+from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
@@ -96,8 +97,8 @@ class ContactsVjp:
             self._add_growth(pressure)
 
     @staticmethod
-    def _where_touching(contacts: BoundContacts, reverse: Callable, i: Any) -> None:
-        jax.lax.cond(contacts.touching(i), lambda: reverse(contacts, i), lambda: None)
+    def _where_touching(contacts: BoundContacts, reverse: Callable, item: Item) -> None:
+        jax.lax.cond(contacts.touching(item), lambda: reverse(contacts, item), lambda: None)
 
     # What a side has, and what is left for it
 
@@ -162,8 +163,9 @@ class ContactsVjp:
 
     # Contacts with a fixed place
 
-    def _rings(self, contacts: BoundContacts, i: Any) -> None:
+    def _rings(self, contacts: BoundContacts, item: Item) -> None:
         """Adds the cotangents of an item's contacts, of the rings of a link or of the palm."""
+        i = item.number
         name = contacts.set.name
         of_palm = name.startswith("palm")
         row = self.palm_row if of_palm else i + 1
@@ -174,7 +176,7 @@ class ContactsVjp:
         mine = self.palm if of_palm else self.body(row), rings
         numbers = self.numbers(name)
         fixed = self._grid_values(mine, numbers) if name.endswith("_object") else self.fixed
-        (body, ring_bars), bars = self._reverse_item(contacts, i, mine, numbers, fixed)
+        (body, ring_bars), bars = self._reverse_item(contacts, item, mine, numbers, fixed)
         self.bars.add(bars)
         self.add_body(body._asdict(), row)
         for j in range(k):
@@ -184,20 +186,20 @@ class ContactsVjp:
             else:
                 self.add_ring(bar, i * k + j)
 
-    def _points(self, contacts: BoundContacts, i: Any) -> None:
+    def _points(self, contacts: BoundContacts, item: Item) -> None:
         """The same of the object's points on table and fixtures that an item deals to the lanes."""
-        point = self.step.block.finger + i * self.layout.fingers
+        point = self.step.block.finger + item.number * self.layout.fingers
         fixed = self.fixed | {"point": self._float(point)}
         if "meshed" in fixed:
             fixed |= self._support_points()
         numbers = self.numbers("object_table")
-        _, bars = self._reverse_item(contacts, i, (), numbers, fixed)
+        _, bars = self._reverse_item(contacts, item, (), numbers, fixed)
         self.bars.add(bars)
 
     def _reverse_item(
         self,
         contacts: BoundContacts,
-        i: Any,
+        item: Item,
         mine: tuple,
         numbers: dict[str, Lanes],
         fixed: dict[str, Any],
@@ -207,14 +209,14 @@ class ContactsVjp:
         Args:
           mine: The first side, see `kinds.Kind`; `numbers`, `fixed`: as in `kinds.power`.
         """
-        fixed = fixed | {Contact.share: contacts.read(Contact.share, i)}
+        fixed = fixed | {Contact.share: contacts.read(Contact.share, item)}
         held = {}
         if contacts.set.holds:
-            held = {Contact.held: contacts.read(Contact.held, i)}
-            fixed |= {HeldBar.held_bar: contacts.read(HeldBar.held_bar, i)}
+            held = {Contact.held: contacts.read(Contact.held, item)}
+            fixed |= {HeldBar.held_bar: contacts.read(HeldBar.held_bar, item)}
         run = partial(kinds.power, self.layout.scene, contacts.set.name)
         mine, _, bars, held_bars = pull(run, (mine, (), numbers, held), (fixed,), self.power_bar)
-        friction_memory.add_held(self.bars, contacts, i, held_bars)
+        friction_memory.add_held(self.bars, contacts, item, held_bars)
         return mine, bars
 
     def _grid_values(self, mine: tuple, numbers: dict[str, Lanes]) -> dict[str, Any]:
@@ -255,12 +257,12 @@ class ContactsVjp:
 
     # Contacts in slots
 
-    def _slot(self, item: UsedSlot) -> None:
+    def _slot(self, item: Item) -> None:
         """Adds the cotangents of a slot's contacts, whose kinds differ by lane."""
         for pair, live in self._kinds_of(item).items():
             any_of(live, partial(self._reverse_slot, pair, item, live))
 
-    def _kinds_of(self, item: UsedSlot) -> dict[str, jax.Array]:
+    def _kinds_of(self, item: Item) -> dict[str, jax.Array]:
         """Lanes of the rings of a slot's contacts, by pair of bodies."""
         pairing = item.pairing
         contacts = self.step.self_contacts
@@ -282,7 +284,7 @@ class ContactsVjp:
         }
         return {pair: which for pair, which in by_pair.items() if on[pair]}
 
-    def _reverse_slot(self, pair: str, item: UsedSlot, live: jax.Array) -> None:
+    def _reverse_slot(self, pair: str, item: Item, live: jax.Array) -> None:
         contacts = self.step.self_contacts
         assert contacts is not None
         remembered = contacts.read(Remembered.ring, item).lane.astype(jnp.int32)
@@ -307,7 +309,7 @@ class ContactsVjp:
         leave(theirs)
 
     def _second_side(
-        self, pair: str, item: UsedSlot, remembered: jax.Array
+        self, pair: str, item: Item, remembered: jax.Array
     ) -> tuple[tuple, dict[str, Lanes], Callable[[tuple], None]]:
         """A slot's second side, what of it has no derivative, and what adds its cotangents."""
         pairing = item.pairing

@@ -26,12 +26,12 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop
+from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.rows import Again, Scratch, Side, Slot
 from codesign_jax.engines.structured.kernel.self_contacts import (
     BoundSelfContacts,
 )
-from codesign_jax.engines.structured.kernel.slots import UsedSlot
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -82,7 +82,7 @@ class Coupling:
         none = jnp.zeros_like(work)
         ones = jnp.ones_like(work)
         # Squared error and curvature; squared error and length of the step before; work.
-        start = (jnp.int32(0), *self._products(), ones, none, work)
+        start = (jnp.int32(0), *self._products(self.contacts), ones, none, work)
 
         def misses(size: jax.Array, work: jax.Array) -> jax.Array:
             return size > self.tolerance * jnp.abs(work)
@@ -98,9 +98,9 @@ class Coupling:
             sound = misses(size, work) & (curvature > 0)
             length = jnp.where(sound, size / jnp.where(sound, curvature, ones), none)
             # The step of a world that has converged has length zero: its contacts add nothing.
-            with self.contacts.only(sound):
-                work = work + length * self._advance(length, turn)
-                new, bent = self._products()
+            among = self.contacts.masked(sound)
+            work = work + length * self._advance(among, length, turn)
+            new, bent = self._products(among)
             # A world that has converged keeps its values: they must not depend on other worlds.
             kept = jnp.where(sound, jnp.maximum(new, 0.0), none)
             return count + 1, kept, bent, jnp.where(sound, size, ones), length, work
@@ -123,7 +123,7 @@ class Coupling:
         contacts = self.contacts
         contacts.clear_wrenches()
 
-        def store(item: UsedSlot) -> None:
+        def store(item: Item) -> None:
             side = contacts.own_side(item)
             hessian = contacts.read(Slot.hessian, item)
             change = contacts.relative(item)
@@ -139,15 +139,14 @@ class Coupling:
 
         contacts.each_item(store)
 
-    def _products(self) -> tuple[jax.Array, jax.Array]:
-        """Applies P^-1 J' to the residual, and J to that: "response".
+    def _products(self, contacts: BoundSelfContacts) -> tuple[jax.Array, jax.Array]:
+        """Applies P^-1 J' to the residual of contacts, and J to that: "response".
 
         Returns the product of the residual with it, and its curvature, shape (lane,) each.
         """
-        contacts = self.contacts
         self.substitute(Again.z_again, self.again())
 
-        def add(item: UsedSlot, sums: list[Lanes]) -> list[Lanes]:
+        def add(item: Item, sums: list[Lanes]) -> list[Lanes]:
             residual = contacts.read(Slot.residual, item)
             hessian = contacts.read(Slot.hessian, item)
             response = contacts.relative(item)
@@ -170,12 +169,13 @@ class Coupling:
         size, bent = (self.block.total(v.lane) for v in sums)
         return size, bent
 
-    def _advance(self, length: jax.Array, turn: jax.Array) -> jax.Array:
-        """Turns the direction and goes along it; returns what that gains of the work.
+    def _advance(
+        self, contacts: BoundSelfContacts, length: jax.Array, turn: jax.Array
+    ) -> jax.Array:
+        """Turns the direction of contacts and goes along it; returns what that gains of the work.
 
         The new residual is laid on the sides.
         """
-        contacts = self.contacts
         contacts.clear_wrenches()
         alpha, beta = (lanes([v], (), wide=False) for v in (length, turn))
         names = (
@@ -192,7 +192,7 @@ class Coupling:
             force = force + alpha * direction
             return direction, direction_response, force, residual - alpha * direction
 
-        def store(item: UsedSlot, gain: Lanes) -> Lanes:
+        def store(item: Item, gain: Lanes) -> Lanes:
             side = contacts.own_side(item)
             hessian = contacts.read(Slot.hessian, item)
             old = [contacts.read(name, item) for name in names]
@@ -219,7 +219,7 @@ class Coupling:
         contacts = self.contacts
         contacts.clear_wrenches()
 
-        def store(item: UsedSlot) -> None:
+        def store(item: Item) -> None:
             value = lanewise(
                 lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read(Slot.force, item)
             )

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import Problem
 from codesign_jax.engines.structured.kernel.rows import Contact, HeldBar, Scratch, Slot, Virtual
 from codesign_jax.engines.structured.kernel.self_contacts import (
@@ -31,7 +32,7 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
     FingerPairing,
 )
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
-from codesign_jax.engines.structured.kernel.slots import UsedSlot, any_of, only
+from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -58,28 +59,19 @@ def held_by_pairing(step: StepMemory, self_contacts: BoundSelfContacts, row: Any
 
 
 def held_by_item(
-    step: StepMemory, contacts: BoundContacts, item: Any
+    step: StepMemory, contacts: BoundContacts, item: Item
 ) -> tuple[Lanes, Lanes] | None:
     """What an item's contacts hold, (3, k): along the world's axes, and as the state has it."""
     if not contacts.set.holds:
         return None
     name = f"held.{contacts.set.name}"
-    k = contacts.set.k
-    rows = [step.finger_state.read(name, item * k + j) for j in range(k)]
-    return _both(step, contacts, lanewise(lambda rows: jnp.stack(rows, 1), rows))
-
-
-def held_by_ring(
-    step: StepMemory, contacts: BoundContacts, ring: jax.Array
-) -> tuple[Lanes, Lanes] | None:
-    """`held_by_item` of rings, one on each of a team's lanes, shape (lane,)."""
-    if not contacts.set.holds:
-        return None
-    held_friction = step.finger_state.gather(f"held.{contacts.set.name}", ring, step.block.column)
-    return _both(step, contacts, lanewise(lambda v: v[:, None], held_friction))
-
-
-def _both(step: StepMemory, contacts: BoundContacts, held_friction: Lanes) -> tuple[Lanes, Lanes]:
+    if jnp.ndim(item.number):
+        row = step.finger_state.gather(name, item.number, step.block.column)
+        held_friction = lanewise(lambda v: v[:, None], row)
+    else:
+        k = contacts.set.k
+        rows = [step.finger_state.read(name, item.number * k + j) for j in range(k)]
+        held_friction = lanewise(lambda rows: jnp.stack(rows, 1), rows)
     if not contacts.set.on_object:
         return held_friction, held_friction
     return lanewise(in_world, step.columns, held_friction), held_friction
@@ -119,8 +111,8 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
         return jnp.where(mask, jnp.where(share > 0, new, 0.0), old)
 
     def store_item(item: jax.Array, x: jax.Array) -> jax.Array:
-        share = contacts.read(Contact.share, item)
-        new = contacts.read(Contact.held, item)
+        share = contacts.read(Contact.share, at(item))
+        new = contacts.read(Contact.held, at(item))
         for j in range(k):
             old = state.read(name, item * k + j)
             state.write(name, lanewise(after, mask, share[j], new[:, j], old), item * k + j)
@@ -138,7 +130,7 @@ def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, held_friction
         force = contact.constraint_update(c, tree_add_scaled(alpha, jar, step)).force
         return sums + counts * sum_axis(holding.hold(c, force, held_friction[:, None]), 1)
 
-    def slot(item: UsedSlot, sums: Lanes) -> Lanes:
+    def slot(item: Item, sums: Lanes) -> Lanes:
         jar = self_contacts.read(Contact.jar, item)
         step = self_contacts.read(Contact.step, item)
         counts = self_contacts.holds(item)
@@ -172,7 +164,7 @@ def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: 
         new = behind(build(place, cone), jar + alpha * step, old, axes)
         return jnp.where(mask, new, old)
 
-    def keep_item(item: Any) -> None:
+    def keep_item(item: Item) -> None:
         def store() -> None:
             place = contacts.place(item)
             cone = contacts.cone_at(item)
@@ -211,13 +203,15 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     self_contacts = problem.self_contacts
     assert self_contacts is not None
 
+    among = self_contacts.masked(which)
+
     def keep_all() -> None:
         mask = lanes([which], (), wide=True)
         first = self_contacts.set.first
 
         def keep_row(row: jax.Array, x: jax.Array) -> jax.Array:
             before, old = problem.read(BETWEEN_FINGERS, Scratch.new_held_friction, item=row + first)
-            new = lanewise(holding.quotient, sums(self_contacts, row, alpha, before))
+            new = lanewise(holding.quotient, sums(among, row, alpha, before))
             problem.write(
                 Scratch.new_held_friction, lanewise(jnp.where, mask, new, old), row + first
             )
@@ -225,8 +219,7 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
         jax.lax.fori_loop(0, self_contacts.set.rows, keep_row, jnp.int32(0))
 
-    with only([self_contacts], which):
-        any_of(which & self_contacts.touching_worlds(), keep_all)
+    any_of(which & among.touching_worlds(), keep_all)
 
 
 def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
@@ -247,7 +240,7 @@ def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, g
     """Leaves the cotangents of a set's contacts as "held_bar"."""
     rest = lanewise(jnp.logical_not, go)
 
-    def reverse_item(item: Any) -> None:
+    def reverse_item(item: Item) -> None:
         held_bar = held_bars(bars, contacts, item)
         contacts.write(HeldBar.held_bar, only_on(go, held_bar), item)
         _write_bars(bars, contacts, item, only_on(rest, held_bar))
@@ -255,29 +248,29 @@ def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, g
     contacts.each_item(reverse_item)
 
 
-def held_bars(bars: CotangentTables, contacts: BoundContacts, item: Any) -> Lanes:
+def held_bars(bars: CotangentTables, contacts: BoundContacts, item: Item) -> Lanes:
     """Cotangents of what an item's contacts hold, (3, k)."""
     name = f"held.{contacts.set.name}"
     k = contacts.set.k
-    rows = [bars.finger_state.read(name, item * k + j) for j in range(k)]
+    rows = [bars.finger_state.read(name, item.number * k + j) for j in range(k)]
     return lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
 
-def _write_bars(bars: CotangentTables, contacts: BoundContacts, item: Any, value: Lanes) -> None:
+def _write_bars(bars: CotangentTables, contacts: BoundContacts, item: Item, value: Lanes) -> None:
     name = f"held.{contacts.set.name}"
     k = contacts.set.k
     for j in range(k):
-        bars.finger_state.write(name, value[:, j], item * k + j)
+        bars.finger_state.write(name, value[:, j], item.number * k + j)
 
 
-def add_held(bars: CotangentTables, contacts: BoundContacts, item: Any, held: dict) -> None:
+def add_held(bars: CotangentTables, contacts: BoundContacts, item: Item, held: dict) -> None:
     """Adds an item's cotangents of what its contacts hold, "held", to those of the state."""
     if contacts.set.holds:
         old = held_bars(bars, contacts, item)
         _write_bars(bars, contacts, item, plus(old, held["held"]))
 
 
-def wrench_of_cotangents(problem: Problem, contacts: BoundContacts, item: Any) -> Lanes:
+def wrench_of_cotangents(problem: Problem, contacts: BoundContacts, item: Item) -> Lanes:
     """Wrench (6,) of what "held_bar" of an item's contacts asks of the step's accelerations.
 
     It is the cotangent of jar, through the force, of what they hold behind the step.
@@ -366,7 +359,7 @@ def load_cotangents(problem: Problem, self_contacts: BoundSelfContacts) -> None:
     def of_held(force, place, cone, held, bars):
         return held_work(contacts(place, cone), force, held, bars)
 
-    def load(item: UsedSlot) -> None:
+    def load(item: Item) -> None:
         which = item.pairing.number
         cone = self_contacts.cone_at(item)
         side = self_contacts.own_side(item)

@@ -10,8 +10,10 @@ from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated, solve_palm_again
 from codesign_jax.engines.structured.kernel.memory import loop, tree_add_scaled
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
 from codesign_jax.engines.structured.kernel.rows import Again, FingerState, Hand, Scratch
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
 from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -31,20 +33,20 @@ LENGTHS = (0.7, 1.4)
 """Lengths of such a step; at others than Newton's, 1, the cost is not quadratic."""
 
 
-def steady(problem: Problem, alpha: Lanes, *, between: bool) -> jax.Array:
+def steady(problem: Problem, alpha: Lanes, between: BoundSelfContacts | None) -> jax.Array:
     """Whether no contact of a world goes to another zone along the last step, (lane,).
 
     Args:
       alpha: Length of the step.
-      between: Whether self-contacts count.
+      between: Contacts of the hand with itself that count; None for none.
     """
     block = problem.block
     count = zeros((), problem.like)
 
-    def add(item: Any, sums: Lanes, contacts: BoundContacts) -> Lanes:
+    def add(item: Item, sums: Lanes, contacts: BoundContacts) -> Lanes:
         return lanewise(jnp.add, sums, contacts.changes(item, alpha))
 
-    sets = [*problem.dealt, *problem.per_link, *(problem.in_slots if between else [])]
+    sets = [*problem.dealt, *problem.per_link, *([between] if between else [])]
     for contacts in sets:
         count = contacts.fold_items(partial(add, contacts=contacts), count)
     if block.team > 1:
@@ -74,13 +76,16 @@ class ChordStep:
         self.links = problem.links
         self.like = problem.like
 
-    def step(self, now: Iterate, done: Eliminated, alpha: Lanes) -> tuple[Iterate, Lanes]:
+    def step(
+        self, now: Iterate, done: Eliminated, alpha: Lanes, between: BoundSelfContacts | None
+    ) -> tuple[Iterate, Lanes]:
         """The step of wrist, palm and object; leaves the fingers' part in "z_again".
 
         Args:
           now: The iterate behind the last step, of wrist, palm and object.
           done: What is left of the palm's elimination.
           alpha: Length of the last step, by which those of the links are still to be moved.
+          between: Contacts of the hand with itself that count; None without any.
 
         Returns:
           The step, and the forces' product with it and that of the fingers: the squared decrement.
@@ -88,8 +93,8 @@ class ChordStep:
         problem = self.problem
         if chambers := problem.chambers:
             chambers.move(alpha)
-        if problem.self_contacts:
-            problem.self_contacts.update_wrenches(alpha)
+        if between:
+            between.update_wrenches(alpha)
 
         def again(alpha, carry, body, moved, forces, factors, pushes, self_wrench):
             r, ro, work = carry
@@ -111,8 +116,8 @@ class ChordStep:
                 (Scratch.link_acc, Scratch.step_link_acc),
             ]
             moved = [problem.read(*rows, item=i) for rows in names]
-            pushes = {c.set.name: c.wrench(i, alpha) for c in problem.per_link}
-            self_wrench = problem.self_contacts.wrench_on(i + 1) if problem.self_contacts else None
+            pushes = {c.set.name: c.wrench(at(i), alpha) for c in problem.per_link}
+            self_wrench = between.wrench_on(i + 1) if between else None
             factors = problem.read(
                 Scratch.axes, Hand.armature, Scratch.w, Scratch.g, Again.inverse, item=i
             )
@@ -128,7 +133,7 @@ class ChordStep:
         if chambers:
             r, ro, less = chambers.close_again(Again.z_again, r, ro)
             work = lanewise(jnp.subtract, work, less)
-        r = problem.add_palm_wrench(r) if problem.self_contacts else r
+        r = problem.add_palm_wrench(r) if between else r
         r, ro, work = self.block.sum((r, ro, work))
         given = now, problem.palm, done, r, ro, work, self._pushes(alpha)
         step, work = lanewise(self._at_palm, *given)
@@ -141,8 +146,8 @@ class ChordStep:
         pushes = {}
         for c in self.problem.dealt:
 
-            def add(i: Any, sums: Lanes, c: BoundContacts = c) -> Lanes:
-                return lanewise(jnp.add, sums, c.wrench(i, alpha))
+            def add(item: Item, sums: Lanes, c: BoundContacts = c) -> Lanes:
+                return lanewise(jnp.add, sums, c.wrench(item, alpha))
 
             wrench = c.fold_items(add, zeros((6,), self.like))
             pushes[c.set.name] = self.block.sum(wrench)

@@ -11,6 +11,7 @@ from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
 from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
 from codesign_jax.engines.structured.kernel.rows import Again, FingerState, Hand, Scratch
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
@@ -50,11 +51,17 @@ class Elimination:
         self.links = problem.links
         self.like = problem.like
 
-    def backward(self, alpha: Lanes) -> tuple[el.Quadratic, Lanes]:
+    def backward(
+        self, alpha: Lanes, between: BoundSelfContacts | None
+    ) -> tuple[el.Quadratic, Lanes]:
         """Eliminates the fingers from their tips.
 
         Accelerations and jar move by `alpha`, the length of the last step, first: so they
         are read once an iteration.
+
+        Args:
+          alpha: Length of the last step, lanes of a world.
+          between: Contacts of the hand with itself that count; None without any.
 
         Returns:
           The sum over the fingers, and the product of their forces with the step so far.
@@ -62,19 +69,19 @@ class Elimination:
         problem = self.problem
         if problem.chambers:
             problem.chambers.move(alpha)
-        if problem.self_contacts:
-            self.between_fingers(problem.self_contacts, alpha)
+        if between:
+            self.between_fingers(between, alpha)
 
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
             acc, link_acc = self.accelerations(i, alpha)
             smooth, tau = self.smooth(i)
             axes, armature = problem.read(Scratch.axes, Hand.armature, item=i)
-            self_wrench = problem.self_contacts.wrench_on(i + 1) if problem.self_contacts else None
+            self_wrench = between.wrench_on(i + 1) if between else None
             node = node._replace(p=full(node.p), q=full(node.q))
             node = lanewise(load_link, node, problem.body_of(i), link_acc, smooth, self_wrench)
             for contacts in problem.per_link:
-                node = self.add_contacts(node, contacts, i, alpha)
+                node = self.add_contacts(node, contacts, at(i), alpha)
             forces = axes, armature, tau, acc
 
             def eliminated(eliminate: Callable) -> tuple[el.Quadratic, Lanes]:
@@ -83,7 +90,7 @@ class Elimination:
                     (Scratch.w, Scratch.g, Scratch.z), kept.factors, strict=True
                 ):
                     problem.write(name, value, i)
-                if problem.in_slots or problem.chambers:
+                if between or problem.chambers:
                     problem.write(Again.inverse, kept.inverse, i)
                 return new._replace(p=upper(new.p), q=upper(new.q)), more
 
@@ -92,7 +99,7 @@ class Elimination:
                 node, more = ways[1]()
             else:
                 node, more = either(i <= last_touching, *ways, self.block.size)
-            return node, lanewise(jnp.add, work, more) if problem.self_contacts else work
+            return node, lanewise(jnp.add, work, more) if between else work
 
         empty = [zeros(s, self.like) for s in ((21,), (6, 6), (21,), (6,), (6,))]
         start = (el.Quadratic(*empty), zeros((), self.like))
@@ -100,7 +107,7 @@ class Elimination:
         node, work = loop(self.links, step, start, self.block.size, reverse=True)
         if problem.chambers:
             node, work = problem.chambers.close(node, work)
-        if problem.self_contacts:
+        if between:
             node = node._replace(r=problem.add_palm_wrench(node.r))
             work = self.block.sum(work)
         node = self.block.sum(node)
@@ -116,12 +123,12 @@ class Elimination:
         """Smooth forces on a link and on the joint before it."""
         return self.problem.read(Scratch.smooth, Scratch.tau, item=i)
 
-    def of_contacts(self, contacts: BoundContacts, item: Any, alpha: Lanes) -> tuple[Lanes, Lanes]:
+    def of_contacts(self, contacts: BoundContacts, item: Item, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Contact inertia (6, 6, ...) and wrench (6, ...) of an item's contacts at a step's length.
 
         Args:
           contacts: A contact set.
-          item: Number of the item: a link, or a group.
+          item: The item: a link, or a group.
           alpha: Length of the last Newton step, by which jar is still behind, lanes of a world.
         """
         return contacts.inertia_and_wrench(item, alpha)
@@ -130,21 +137,21 @@ class Elimination:
         self_contacts.update_constraints(alpha)
 
     def add_contacts(
-        self, node: el.Quadratic, contacts: BoundContacts, i: Any, alpha: Lanes
+        self, node: el.Quadratic, contacts: BoundContacts, item: Item, alpha: Lanes
     ) -> Any:
         def add() -> el.Quadratic:
             return lanewise(
-                _add, node, *self.of_contacts(contacts, i, alpha), contacts.set.on_object
+                _add, node, *self.of_contacts(contacts, item, alpha), contacts.set.on_object
             )
 
-        return choose(contacts.touching(i), add, node, self.block.size)
+        return choose(contacts.touching(item), add, node, self.block.size)
 
     def last_on_object(self) -> jax.Array | None:
         """Last link with contacts with the object, -1 for none; None if the scene has none."""
         on_object = [c for c in self.problem.per_link if c.set.on_object]
 
         def later(i: Any, last: jax.Array) -> jax.Array:
-            return jnp.where(on_object[0].touching(i), jnp.asarray(i, jnp.int32), last)
+            return jnp.where(on_object[0].touching(at(i)), jnp.asarray(i, jnp.int32), last)
 
         return jax.lax.fori_loop(0, self.links, later, jnp.int32(-1)) if on_object else None
 
@@ -153,8 +160,8 @@ class Elimination:
         pushes = {}
         for c in self.problem.dealt:
 
-            def add(i: Any, carry: tuple, c: BoundContacts = c) -> tuple:
-                matrix, wrench = self.of_contacts(c, i, alpha)
+            def add(item: Item, carry: tuple, c: BoundContacts = c) -> tuple:
+                matrix, wrench = self.of_contacts(c, item, alpha)
                 return lanewise(
                     lambda a, b: jax.tree.map(jnp.add, a, b), carry, (upper(matrix), wrench)
                 )

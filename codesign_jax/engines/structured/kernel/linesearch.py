@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import elimination as el
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.memory import anywhere, loop, solid
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import (
     Iterate,
     Palm,
@@ -16,7 +17,7 @@ from codesign_jax.engines.structured.kernel.problem import (
     relative,
 )
 from codesign_jax.engines.structured.kernel.rows import FingerState, Hand, Scratch, Side
-from codesign_jax.engines.structured.kernel.slots import only
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -35,8 +36,15 @@ class LineSearch:
         self.links = problem.links
         self.like = problem.like
 
-    def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
+    def prepare(
+        self, now: Iterate, step: Iterate, between: BoundSelfContacts | None
+    ) -> tuple[Lanes, Lanes, Lanes]:
         """Substitutes back and prepares the line search.
+
+        Args:
+          now: The iterate.
+          step: The Newton step of wrist, palm and object.
+          between: Contacts of the hand with itself that count; None without any.
 
         Returns:
           Slope and curvature of the smooth part, and the contacts' slope, all at 0, (1, world).
@@ -72,27 +80,27 @@ class LineSearch:
             )
             problem.write(Scratch.step_acc, a, i)
             problem.write(Scratch.step_link_acc, moved, i)
-            if problem.self_contacts:
-                problem.self_contacts.put(Side.link_acc, moved, i + 1)
+            if between:
+                between.put(Side.link_acc, moved, i + 1)
             terms = [contact_slope]
             for contacts in problem.per_link:
                 rel = relative(contacts.set.name, moved, step.palm_acc, step.object_acc)
-                terms.append(contacts.prepare_linesearch(i, rel))
+                terms.append(contacts.prepare_linesearch(at(i), rel))
             contact_slope = lanewise(lambda t: total(t), terms)
             slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
             return moved, slope, curvature, contact_slope
 
         none = zeros((), self.like)
         parent = problem.widened(step.palm_acc)
-        if problem.self_contacts:
-            problem.self_contacts.put(Side.link_acc, parent, 0)
+        if between:
+            between.put(Side.link_acc, parent, 0)
         _, slope, curvature, contact_slope = loop(
             self.links, link, (parent, none, none, none), self.block.size
         )
         if problem.chambers:
             curvature = lanewise(jnp.add, curvature, problem.chambers.curvature())
-        between = [problem.self_contacts.prepare_all()] if problem.self_contacts else []
-        contact_slope = lanewise(lambda t: total(t), [contact_slope, *between])
+        slopes = [contact_slope, *([between.prepare_all()] if between else [])]
+        contact_slope = lanewise(lambda t: total(t), slopes)
         contact_slope = self.prepare_slots(contact_slope, step)
         slope, curvature, contact_slope = self.block.sum((slope, curvature, contact_slope))
         slope, curvature = lanewise(with_palm_and_object, now, step, problem.palm, slope, curvature)
@@ -102,38 +110,49 @@ class LineSearch:
         """Adds the slopes of the palm's and the object's contacts along the step."""
         for contacts in self.problem.dealt:
 
-            def add(i: Any, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
+            def add(item: Item, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
                 rel = relative(contacts.set.name, None, step.palm_acc, step.object_acc)
-                return lanewise(jnp.add, sum_, contacts.prepare_linesearch(i, rel))
+                return lanewise(jnp.add, sum_, contacts.prepare_linesearch(item, rel))
 
-            touch = loop(contacts.set.count, add, touch, self.block.size)
+            touch = contacts.fold_items(add, touch)
         return touch
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:
         """Sums of lanes over the fingers of each world."""
         return self.block.sum(sums)
 
-    def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
-        """First and second derivative of the contacts' cost by the step length, at alpha."""
+    def contact_slopes(self, alpha: Lanes, between: BoundSelfContacts | None) -> list[Lanes]:
+        """First and second derivative of the contacts' cost by the step length, at alpha.
 
-        def add(i: Any, sums: list, sets: list) -> list:
+        Args:
+          alpha: Length of the step, lanes of a world.
+          between: As in `prepare`.
+        """
+
+        def add(item: Item, sums: list, sets: list) -> list:
             for contacts in sets:
-                new = contacts.slopes(i, alpha)
+                new = contacts.slopes(item, alpha)
                 sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
             return sums
 
         problem = self.problem
         sums = [zeros((), self.like)] * 2
         if sets := problem.per_link:
-            sums = loop(self.links, lambda i, s: add(i, s, sets), sums, self.block.size)
+            sums = loop(self.links, lambda i, s: add(at(i), s, sets), sums, self.block.size)
         for c in problem.dealt:
-            sums = loop(c.set.count, lambda i, s, c=c: add(i, s, [c]), sums, self.block.size)
-        if problem.self_contacts:
-            sums = problem.self_contacts.slopes_of_all(alpha, sums)
+            sums = c.fold_items(lambda item, s, c=c: add(item, s, [c]), sums)
+        if between:
+            sums = between.slopes_of_all(alpha, sums)
         return sums
 
     def find(
-        self, slope: Lanes, curvature: Lanes, first: Lanes, floor: jax.Array, evaluations: int
+        self,
+        slope: Lanes,
+        curvature: Lanes,
+        first: Lanes,
+        floor: jax.Array,
+        evaluations: int,
+        between: BoundSelfContacts | None,
     ) -> Lanes:
         """Step length, lanes of a world.
 
@@ -142,10 +161,11 @@ class LineSearch:
             contacts.
           floor: Slope that is small enough.
           evaluations: Largest number of evaluations.
+          between: As in `prepare`.
         """
 
-        def evaluate(alpha: Lanes) -> tuple[Lanes, Lanes]:
-            of_contacts = self.total(self.contact_slopes(alpha))
+        def evaluate(alpha: Lanes, among: BoundSelfContacts | None) -> tuple[Lanes, Lanes]:
+            of_contacts = self.total(self.contact_slopes(alpha, among))
             return lanewise(with_contacts, slope, curvature, alpha, *of_contacts)
 
         def body(carry: list) -> list:
@@ -154,8 +174,7 @@ class LineSearch:
             # A world that has found its step length keeps it: it must not depend on other worlds.
             left = jnp.abs(carry[-1]) > goal
             searching = lanes([left], (), wide=False)
-            with only(self.problem.in_slots, left):
-                derivative, second = evaluate(old[0])
+            derivative, second = evaluate(old[0], between.masked(left) if between else None)
             new = (*lanewise(refine, *old[:3], derivative, second), derivative)
             new = [lanewise(jnp.where, searching, a, b) for a, b in zip(new, old, strict=True)]
             return [count + 1, *solid(tuple(new), self.block.size)[0]]

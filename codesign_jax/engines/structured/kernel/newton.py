@@ -31,7 +31,8 @@ from codesign_jax.engines.structured.kernel.memory import (
 )
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
 from codesign_jax.engines.structured.kernel.rows import FingerState
-from codesign_jax.engines.structured.kernel.slots import any_of, only
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
+from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.team_solver import (
     TeamCoupling,
     TeamElimination,
@@ -68,11 +69,10 @@ class Newton:
         self.search = (LineSearch if single_lanes else TeamLineSearch)(problem)
         self.coupling = Coupling if single_lanes else TeamCoupling
         # A chord's step would take a GPU as long as it saves: there an iteration ends without one.
-        threads = bool(problem.in_slots) and problem.in_slots[0].set.gathers
-        self.accepts_steady = threads
-        self.chord = (
-            ChordStep(problem) if problem.in_slots and single_lanes and not threads else None
-        )
+        pairs = problem.self_contacts
+        self.accepts_steady = pairs is not None and pairs.set.gathers
+        chords = pairs is not None and not pairs.set.gathers
+        self.chord = ChordStep(problem) if chords and single_lanes else None
 
     def solve(
         self, now: Iterate, waiting: jax.Array, iterations: int, evaluations: int, tolerance: float
@@ -96,12 +96,12 @@ class Newton:
             now, before, last = rebuild(carry[1:])
             busy = waiting & (before.lane > tolerance)
             # A world that has converged keeps its iterate, so its contacts need not be looked at.
-            with only(problem.in_slots, busy):
-                step, done = self.direction(now, last, ~busy)
-                slope, curvature, first = self.search.prepare(now, step)
-                decrement, scale = lanewise(_decrement, slope, first, problem.palm, now.object_acc)
-                floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, FAR)
-                alpha = self.search.find(slope, curvature, first, floor, evaluations)
+            between = problem.between(busy)
+            step, done = self.direction(now, last, ~busy, between)
+            slope, curvature, first = self.search.prepare(now, step, between)
+            decrement, scale = lanewise(_decrement, slope, first, problem.palm, now.object_acc)
+            floor = jnp.where(busy, LINE_TOLERANCE * tolerance * scale.lane, FAR)
+            alpha = self.search.find(slope, curvature, first, floor, evaluations, between)
             alpha, decrement = lanewise(unless_converged, before, alpha, decrement)
             newton = alpha  # of the contacts, which the chord's step does not move
             now = lanewise(tree_add_scaled, alpha, now, step)
@@ -161,8 +161,7 @@ class Newton:
           decrement: The decrement; `alpha`: length of the step.
           likely: Lanes of worlds whose decrement is near the tolerance, see `STEADY`.
         """
-        with only(self.problem.in_slots, likely):
-            ends = likely & steady(self.problem, alpha, between=True)
+        ends = likely & steady(self.problem, alpha, self.problem.between(likely))
         newton = (alpha.lane > LENGTHS[0]) & (alpha.lane < LENGTHS[1])
         mask = lanes([ends & newton], (), wide=False)
         return lanewise(lambda e, r: jnp.where(e, tolerance, r), mask, decrement)
@@ -190,17 +189,15 @@ class Newton:
           Iterate, length and decrement, see `ChordStep`; the length is that of "step_acc".
         """
         chord = self.chord
-        self_contacts = self.problem.self_contacts
+        between = self.problem.between(likely)
         size = self.block.size
         assert chord is not None
 
         def look(likely: jax.Array) -> tuple[Iterate, Lanes, Lanes]:
-            more, work = chord.step(now, done, alpha)
+            more, work = chord.step(now, done, alpha, between)
             new = lanewise(jnp.divide, work, scale)
             converged = likely & (new.lane >= 0) & (new.lane <= tolerance)
-            taken = (
-                converged if self_contacts is None else converged & ~self_contacts.touching_worlds()
-            )
+            taken = converged if between is None else converged & ~between.touching_worlds()
 
             def take() -> tuple[Iterate, Lanes]:
                 chord.take(more, alpha, taken)
@@ -217,27 +214,31 @@ class Newton:
             small = lanes([converged], (), wide=False)
             return there, length, lanewise(jnp.where, small, new, decrement)
 
-        with only(self.problem.in_slots, likely):
-            ending = likely & steady(self.problem, alpha, between=False)
-            as_was = now, alpha, decrement
-            return choose(anywhere(ending), lambda: look(ending), as_was, size)
+        ending = likely & steady(self.problem, alpha, None)
+        as_was = now, alpha, decrement
+        return choose(anywhere(ending), lambda: look(ending), as_was, size)
 
-    def direction(self, now: Iterate, last: Lanes, idle: jax.Array) -> tuple[Iterate, Eliminated]:
+    def direction(
+        self, now: Iterate, last: Lanes, idle: jax.Array, between: BoundSelfContacts | None
+    ) -> tuple[Iterate, Eliminated]:
         """Newton's step: the fingers' factors, and the step of wrist and object.
 
-        Last is the length of the last step; the step of idle lanes is of no use.
+        Args:
+          now: The iterate.
+          last: Length of the last step, lanes of a world.
+          idle: Lanes whose step is of no use.
+          between: Contacts of the hand with itself in the other worlds; None without any.
         """
-        self_contacts = self.problem.self_contacts
-        node, work = self.elimination.backward(last)
+        node, work = self.elimination.backward(last, between)
         step, done = self.elimination.at_palm(now, node, self.elimination.of_dealt_contacts(last))
-        if self_contacts is None:
+        if between is None:
             return step, done
         done = done._replace(work=lanewise(jnp.add, done.work, work))
 
         def correct() -> Iterate:
-            return self.coupling(self.problem, self_contacts, done).correct(step, idle)
+            return self.coupling(self.problem, between, done).correct(step, idle)
 
-        return choose(self_contacts.touching_now(), correct, step, self.block.size), done
+        return choose(between.touching_now(), correct, step, self.block.size), done
 
 
 WEIGHT_SQUARE = 100.0

@@ -9,6 +9,7 @@ from codesign_jax.engines.structured.kernel.chambers import Chambers
 from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
 from codesign_jax.engines.structured.kernel.rows import Air, Hand, Scratch
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
@@ -49,7 +50,6 @@ class Problem:
       links: Moving links of a finger; `block`: the lanes; `like`: zeros of their shape and type.
       rigid: Whether the wrist's accelerations are known and no unknowns.
       self_contacts: Contacts of the hand with itself; None without.
-      in_slots: The contact sets that are kept in slots: these, or none.
       per_link: Contacts of the fingers with what is no finger, whose items are links.
       dealt: Contacts of the palm, and of the object with the table, whose items are dealt to the
         fingers' lanes.
@@ -65,9 +65,12 @@ class Problem:
         self.self_contacts = memory.self_contacts
         self.per_link = [c for c in memory.field_contacts if c.set.per_link]
         self.dealt = [c for c in memory.field_contacts if not c.set.per_link]
-        self.in_slots = [self.self_contacts] if self.self_contacts else []
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
         self.chambers = Chambers(memory) if Air.air_step in memory.scratch else None
+
+    def between(self, busy: jax.Array) -> BoundSelfContacts | None:
+        """Contacts of the hand with itself in worlds of the lanes `busy`; None without any."""
+        return None if self.self_contacts is None else self.self_contacts.masked(busy)
 
     def read(self, *names: str, item: Any = 0) -> list[Lanes]:
         """Reads names; of the joints' armature that of this step, if it changes."""

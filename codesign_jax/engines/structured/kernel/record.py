@@ -20,6 +20,7 @@ from codesign_jax.engines.structured.kernel.contact_sets import (
     zeros,
 )
 from codesign_jax.engines.structured.kernel.memory import BoundTable, choose
+from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, relative
 from codesign_jax.engines.structured.kernel.rows import (
     Contact,
@@ -33,7 +34,6 @@ from codesign_jax.engines.structured.kernel.rows import (
 )
 from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
-from codesign_jax.engines.structured.kernel.slots import UsedSlot, only
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -73,18 +73,18 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
     mask = lanes([ends], (), wide=True)
     step = problem.memory
 
-    def moved(contacts: BoundContacts, item: Any) -> Lanes:
+    def moved(contacts: BoundContacts, item: Item) -> Lanes:
         jar = contacts.read(Contact.jar, item)
         return lanewise(_moved, mask, jar, alpha, contacts.read(Contact.step, item))
 
-    def put(contacts: BoundContacts, item: Any, jar: Lanes) -> None:
+    def put(contacts: BoundContacts, item: Item, jar: Lanes) -> None:
         old = contacts.read(Contact.step, item)
         contacts.write(Contact.jar, jar, item)
         contacts.write(Contact.step, lanewise(_zero_where, mask, old), item)
 
     for contacts in (*problem.per_link, *problem.dealt):
 
-        def settle_item(item: Any, contacts: BoundContacts = contacts) -> None:
+        def settle_item(item: Item, contacts: BoundContacts = contacts) -> None:
             def store() -> None:
                 jar = moved(contacts, item)
                 if Scratch.chord_link_acc in step.scratch:
@@ -98,23 +98,22 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
     if problem.self_contacts is not None:
         self_contacts = problem.self_contacts
 
-        def settle_slot(item: UsedSlot) -> None:
+        def settle_slot(item: Item) -> None:
             put(self_contacts, item, moved(self_contacts, item))
 
-        with only([self_contacts], ends):
-            self_contacts.each_item(settle_slot)
+        self_contacts.masked(ends).each_item(settle_slot)
     if Scratch.chord_link_acc in step.scratch:
         _each(problem.links, lambda i: step.scratch.write(
             Scratch.chord_link_acc, zeros((6,), step.like), i
         ))  # fmt: skip
 
 
-def _chord_of(problem: Problem, contacts: BoundContacts, item: Any, chord: Iterate) -> Lanes:
+def _chord_of(problem: Problem, contacts: BoundContacts, item: Item, chord: Iterate) -> Lanes:
     """Change of a set's relative acceleration by the chord step, shape (6,)."""
     name = contacts.set.name
     link = None
     if contacts.set.per_link:
-        link = problem.memory.scratch.read(Scratch.chord_link_acc, item)
+        link = problem.memory.scratch.read(Scratch.chord_link_acc, item.number)
     return relative(name, link, chord.palm_acc, chord.object_acc)
 
 
@@ -131,7 +130,7 @@ def _write_set(step: StepMemory, name: str, contacts: BoundContacts, table: Boun
     energy = f"{name}.{ForceSum.energy}" in table
     none = [zeros((3,), step.like), *[zeros((), step.like)] * (2 + energy)]
 
-    def add(item: Any, sums: list[Lanes]) -> list[Lanes]:
+    def add(item: Item, sums: list[Lanes]) -> list[Lanes]:
         def added() -> list[Lanes]:
             numbers = contacts.place(item), contacts.cone_at(item), contacts.read(Contact.jar, item)
             held = friction_memory.held_by_item(step, contacts, item) if energy else None
@@ -154,7 +153,7 @@ def _write_rings(step: StepMemory, name: str, contacts: BoundContacts, table: Bo
     """Writes place and force of each of a set's rings, those that do not touch as well."""
     position = step.world_state.read(WorldState.position)
 
-    def put(item: Any) -> None:
+    def put(item: Item) -> None:
         place = contacts.place(item)
         numbers = place, contacts.cone_at(item), contacts.read(Contact.jar, item)
         force = lanewise(force_of_jar, *numbers)
@@ -173,7 +172,7 @@ def _write_pairing(
     energy = f"{SELF}.{PairForce.energy}" in table
     hold = friction_memory.held_by_pairing(step, contacts, row) if energy else []
 
-    def add(item: UsedSlot, sums: list[Lanes]) -> list[Lanes]:
+    def add(item: Item, sums: list[Lanes]) -> list[Lanes]:
         itself = item.pairing.itself
         palm = jnp.zeros_like(step.like)
         if itself is not None:

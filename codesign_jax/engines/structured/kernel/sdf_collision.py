@@ -8,13 +8,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
 from codesign_jax.engines.structured.kernel.kinds import beside
 from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import relative
 from codesign_jax.engines.structured.kernel.rows import (
     Contact,
@@ -96,8 +96,10 @@ class SdfCollision:
         for name in self.names:
             numbers = self.numbers(i)
             centre = lanewise(ring_centres, origin, frame, numbers)
-            hold = friction_memory.held_by_item(self.step, self.contacts[name], i)
-            self.on_field(name, i, numbers, frame, centre, self.moves(name, link_acc, vel), hold)
+            hold = friction_memory.held_by_item(self.step, self.contacts[name], at(i))
+            self.on_field(
+                name, at(i), numbers, frame, centre, self.moves(name, link_acc, vel), hold
+            )
 
     def of_rings(self, search: SelfCollision) -> None:
         """Contacts of the fingers' rings, dealt to the lanes of a team."""
@@ -105,23 +107,16 @@ class SdfCollision:
             contacts = self.contacts[name]
             contacts.begin_step()  # type: ignore[attr-defined]
 
-            def ring(
-                slot: Any,
-                item: jax.Array,
-                nothing: list,
-                name: str = name,
-                contacts: BoundContacts = contacts,
-            ) -> list:
-                row, numbers, frame, centre = search.body(item)
+            def ring(item: Item, name: str = name, contacts: BoundContacts = contacts) -> None:
+                row, numbers, frame, centre = search.body(item.number)
                 numbers, centre = (lanewise(as_item, v) for v in (numbers, centre))
                 moves = self.moves(
                     name, *(search.side_of(n, row) for n in (Side.link_acc, Side.vel))
                 )
-                hold = friction_memory.held_by_ring(self.step, contacts, item)
-                self.on_field(name, slot, numbers, frame, centre, moves, hold)
-                return nothing
+                hold = friction_memory.held_by_item(self.step, contacts, item)
+                self.on_field(name, item, numbers, frame, centre, moves, hold)
 
-            contacts.every(ring, [])  # type: ignore[attr-defined]
+            contacts.each_item(ring)
 
     def numbers(self, i: Any) -> Lanes:
         k = self.layout.rings_per_link
@@ -131,7 +126,7 @@ class SdfCollision:
     def on_field(
         self,
         name: str,
-        i: Any,
+        item: Item,
         numbers: Lanes,
         frame: Lanes,
         centre: Lanes,
@@ -145,13 +140,13 @@ class SdfCollision:
         friction = self.frictions(name, contacts.set.k // len(looks))
         if self.surface == "spheres":
             places = [lanewise(ball_on_field, numbers, centre, *first) for first in seen]
-            return contacts.create(i, joined(places), *moves, friction=friction)
+            return contacts.create(item, joined(places), *moves, friction=friction)
         flat = (
             not name.endswith("_object") and self.layout.scene.effects.table
         )  # the table comes first
         most = self.closing_gap(numbers, centre, moves[1])
         near = [lanewise(may_touch, numbers, first[0], most).lane for first in seen]
-        contacts.write(Contact.share, zeros((contacts.set.k,), self.step.like), i)
+        contacts.write(Contact.share, zeros((contacts.set.k,), self.step.like), item)
 
         def look_again() -> None:
             faced = []
@@ -163,7 +158,7 @@ class SdfCollision:
 
         def create(faced: list[Facing]) -> None:
             places = [lanewise(ring_place, numbers, frame, centre, face) for face in faced]
-            contacts.create(i, joined(places), *moves, friction=friction, hold=hold)
+            contacts.create(item, joined(places), *moves, friction=friction, hold=hold)
 
         any_of(total(near) > 0, look_again)
 
@@ -188,8 +183,8 @@ class SdfCollision:
             centre = lanewise(ring_centres, bodies["place"], bodies["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)
-                hold = friction_memory.held_by_item(self.step, self.contacts[name], i)
-                self.on_field(name, i, numbers, bodies["frame"], centre, moves, hold)
+                hold = friction_memory.held_by_item(self.step, self.contacts[name], at(i))
+                self.on_field(name, at(i), numbers, bodies["frame"], centre, moves, hold)
         on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
         rubs = self.frictions("object_table")
@@ -201,8 +196,8 @@ class SdfCollision:
             if rubs is not None:
                 (friction,) = self._deal([(rubs[:, k],) for k in mine])
             moves = self.moves("object_table", None, None)
-            hold = friction_memory.held_by_item(self.step, on_table, i)
-            on_table.create(i, place, *moves, friction=friction, hold=hold)
+            hold = friction_memory.held_by_item(self.step, on_table, at(i))
+            on_table.create(at(i), place, *moves, friction=friction, hold=hold)
 
     def _table_points(self, state: dict) -> list[Place]:
         """Each point of the object on the table and the fixtures, lanes of a world."""

@@ -27,9 +27,10 @@ from codesign_jax.engines.structured.kernel.memory import (
     solid,
     tree_add_scaled,
 )
+from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.rows import Contact, Field, Group, Rows, Side, Slot
 from codesign_jax.engines.structured.kernel.shared_memory import TEAM
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotSet, UsedSlot, any_of
+from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotSet, any_of
 from codesign_jax.engines.structured.lanes import dot, sum_axis, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
@@ -165,7 +166,7 @@ class BoundSelfContacts(BoundSlots):
     def deepest_in_palm(self, depth: Lanes) -> Lanes:
         """The larger of a depth and those of the fingers' contacts with the palm [m]."""
 
-        def deeper(item: Any, depth: Lanes) -> Lanes:
+        def deeper(item: Item, depth: Lanes) -> Lanes:
             fields = (self.read(name, item)[0] for name in (Contact.share, Contact.gap))
             return lanewise(_deeper_in_palm, depth, self.read(Slot.other, item)[0, 0], *fields)
 
@@ -186,7 +187,7 @@ class BoundSelfContacts(BoundSlots):
         here = lanes([palm], (), wide=other is not None)
         return lanewise(_where, here, self._cones["finger_palm"], self._cones["finger_finger"])
 
-    def holds(self, item: UsedSlot) -> Lanes:
+    def holds(self, item: Item) -> Lanes:
         """One for contacts whose friction is kept, zero for those with the palm."""
         pairing = item.pairing
         kept = jnp.ones_like(self.like)
@@ -233,7 +234,7 @@ class BoundSelfContacts(BoundSlots):
         pairing = self.pairing(row)
         mixed = self.set.with_itself and touches_itself(self.set.scene)
 
-        def slot(item: UsedSlot, carry: Any) -> Any:
+        def slot(item: Item, carry: Any) -> Any:
             other = self.read(Slot.other, item).lane if mixed else None
             return body(item._replace(pairing=pairing, cone=self.cone_of_row(row, other)), carry)
 
@@ -244,10 +245,10 @@ class BoundSelfContacts(BoundSlots):
         size = self.set.size
         return loop(self.set.rows, lambda row, carry: self.fold(row, body, carry), start, size)
 
-    def each_item(self, body: Callable[[Any], None]) -> None:
+    def each_item(self, body: Callable[[Item], None]) -> None:
         """See `BoundContacts`; for all slots in use."""
 
-        def slot(item: UsedSlot, nothing: list) -> list:
+        def slot(item: Item, nothing: list) -> list:
             body(item)
             return nothing
 
@@ -267,7 +268,7 @@ class BoundSelfContacts(BoundSlots):
 
     # One side's part of a contact
 
-    def relative(self, item: UsedSlot) -> Lanes:
+    def relative(self, item: Item) -> Lanes:
         """Relative acceleration of a slot's sides by the links', on its own side's lanes."""
         contacts = self.set.contacts
         pairing = item.pairing
@@ -288,7 +289,7 @@ class BoundSelfContacts(BoundSlots):
         theirs = either(anywhere(pairing.itself), *ways, self.set.size)
         return lanewise(jnp.subtract, mine, theirs)
 
-    def _on_rows(self, item: Any, field: Field) -> Lanes:
+    def _on_rows(self, item: Item, field: Field) -> Lanes:
         """Accelerations of the links in a field of a slot's lanes; zeros where nothing touches."""
         if self.set.gathers:
             row = self.read(field, item).lane.astype(jnp.int32)
@@ -307,14 +308,14 @@ class BoundSelfContacts(BoundSlots):
         if self.set.gathers:
             return
 
-        def store(item: UsedSlot) -> None:
+        def store(item: Item) -> None:
             self._list_rows(item, Slot.row)
             if item.pairing.itself is not None:
                 any_of(item.pairing.itself, lambda: self._list_rows(item, Slot.other))
 
         self.each_item(store)
 
-    def _list_rows(self, item: Any, field: Field) -> None:
+    def _list_rows(self, item: Item, field: Field) -> None:
         """Lists the different rows at which a slot's lanes touch.
 
         The k-th row is stored on the k-th lane of the field's list, their number on all lanes.
@@ -334,12 +335,12 @@ class BoundSelfContacts(BoundSlots):
         self.write(f"{field}_listed", lanes([listed], (1, 1), wide=True), item)
         self.write(f"{field}_count", lanes([counts], (1, 1), wide=True), item)
 
-    def _touched_rows(self, item: Any, field: Field) -> jax.Array:
+    def _touched_rows(self, item: Item, field: Field) -> jax.Array:
         """Row of each lane's side of a slot, int32, shape (lane,); -1 where nothing touches."""
         touches = self.read(Contact.share, item).lane > 0
         return jnp.where(touches, self.read(field, item).lane.astype(jnp.int32), -1)
 
-    def _each_row(self, item: Any, field: Field, body: Callable, start: Any) -> Any:
+    def _each_row(self, item: Item, field: Field, body: Callable, start: Any) -> Any:
         """Folds body(row, lanes that touch there, tree of lanes) over the rows of a slot's lanes.
 
         Few lanes of a block touch in one slot, at two rows if it is one contact: on CPUs whose
@@ -367,7 +368,7 @@ class BoundSelfContacts(BoundSlots):
 
         jax.lax.fori_loop(0, self.rows(), clear, jnp.int32(0))
 
-    def own_side(self, item: Any) -> OwnSide:
+    def own_side(self, item: Item) -> OwnSide:
         """Reads a slot's own side, for `load`; before anything of the slot is stored."""
         if not self.set.gathers:
             return OwnSide(self.place(item), None, None)
@@ -375,7 +376,7 @@ class BoundSelfContacts(BoundSlots):
         wrench = self.table.gather(Side.wrench, row, self.block.column)
         return OwnSide(self.place(item), row, wrench)
 
-    def load(self, item: UsedSlot, side: OwnSide, force: Lanes) -> None:
+    def load(self, item: Item, side: OwnSide, force: Lanes) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
         pairing = item.pairing
         more = lanewise(wrench_of_force, side.place, self.cone_at(item), force)
@@ -389,7 +390,7 @@ class BoundSelfContacts(BoundSlots):
 
     def _add_wrench(
         self,
-        item: Any,
+        item: Item,
         field: Field,
         more: Lanes,
         sums: Lanes | None = None,
@@ -416,7 +417,7 @@ class BoundSelfContacts(BoundSlots):
         """Adds the last step of the line search to jar; stores Hessians and adds up wrenches."""
         self.clear_wrenches()
 
-        def store(item: UsedSlot) -> None:
+        def store(item: Item) -> None:
             side = self.own_side(item)
             self.load(item, side, self.update_constraint(item, side.place, alpha))
 
@@ -430,7 +431,7 @@ class BoundSelfContacts(BoundSlots):
         def response(place, cone, alpha, jar, step):
             return contact.constraint_update(contacts(place, cone), jar + alpha * step).force
 
-        def load(item: UsedSlot) -> None:
+        def load(item: Item) -> None:
             side = self.own_side(item)
             jar = self.read(Contact.jar, item)
             step = self.read(Contact.step, item)
@@ -444,7 +445,7 @@ class BoundSelfContacts(BoundSlots):
         return lanewise(_times, hessian, change)
 
     def prepare_all(self) -> Lanes:
-        def add(item: UsedSlot, sums: Lanes) -> Lanes:
+        def add(item: Item, sums: Lanes) -> Lanes:
             slope = self.line(item, self.relative(item))
             return lanewise(lambda s, h, f: s + h * f, sums, item.pairing.half, slope)
 
@@ -453,7 +454,7 @@ class BoundSelfContacts(BoundSlots):
     def slopes_of_all(self, alpha: Lanes, sums: list[Lanes]) -> list[Lanes]:
         """Sums of the first and second derivative of the cost by the step length."""
 
-        def add(item: UsedSlot, sums: list[Lanes]) -> list[Lanes]:
+        def add(item: Item, sums: list[Lanes]) -> list[Lanes]:
             new = self._slopes(item, alpha)
             return lanewise(tree_add_scaled, item.pairing.half, sums, new)
 

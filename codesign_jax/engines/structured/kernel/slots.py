@@ -5,10 +5,10 @@ the largest number that any active lane has filled.  Its cost therefore grows wi
 exist in worlds that still iterate, not with those that are possible.
 """
 
-import contextlib
+import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from codesign_jax.engines.structured.kernel.memory import (
     solid,
     tree_add_scaled,
 )
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.rows import Contact, Group, Rows, Slot, SlotCount
 from codesign_jax.engines.structured.lanes import total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -123,21 +124,6 @@ class SlotSet(ContactSet):
         return BoundSlots(self, table, self.cone(read))
 
 
-class UsedSlot(NamedTuple):
-    """A slot in a pass through a row.
-
-    Where lanes gather, those that have filled it, and whose worlds the pass is for, use it. All
-    others read an item where nothing touches, the same in every slot, and write to one that nobody
-    reads. So a GPU's memory, which is what its threads wait for, is asked for little that no lane
-    uses.
-    """
-
-    source: Any  # Item that each lane reads, int32, shape (lane,); a scalar if lanes do not gather
-    sink: Any  # Item that each lane writes, likewise
-    pairing: Any = None  # `self_contacts.FingerPairing` of a contact of the hand with itself
-    cone: Any = None  # The contact's cone, where those of a set differ
-
-
 class BoundSlots(BoundContacts):
     """Slots with their memory; methods work on a row."""
 
@@ -145,36 +131,13 @@ class BoundSlots(BoundContacts):
     _counts: SlotCounts | None = None
 
     def clear(self, row: Any) -> None:
-        self.write(SlotCount.count, zeros((), self.like), row)
-
-    def read(self, field: str, item: Any) -> Lanes:
-        """See `BoundContacts`; an item may be a `UsedSlot`."""
-        source = item.source if isinstance(item, UsedSlot) else item
-        if not jnp.ndim(source):
-            return super().read(field, source)
-        return self.table.gather(f"{self.set.name}.{field}", source, self._lane())
-
-    def write(self, field: str, value: Lanes, item: Any) -> None:
-        """See `BoundContacts`; an item may be a `UsedSlot`."""
-        sink = item.sink if isinstance(item, UsedSlot) else item
-        if jnp.ndim(sink):
-            self.table.scatter(f"{self.set.name}.{field}", value, sink, self._lane())
-        else:
-            super().write(field, value, sink)
-
-    def cone_at(self, item: Any) -> contact.Cone:
-        """See `BoundContacts`; a slot has its own where cones of the set differ."""
-        cone = item.cone if isinstance(item, UsedSlot) else None
-        return super().cone_at(item) if cone is None else cone
-
-    def _lane(self) -> jax.Array:
-        return jax.lax.broadcasted_iota(jnp.int32, (self.set.size,), 0)
+        self.write(SlotCount.count, zeros((), self.like), at(row))
 
     def keep_counts(self) -> None:
         """Keeps in registers how many slots lanes have filled, when all contacts are found."""
         rows = range(self.set.rows)
         most = self.set.slots
-        counts = [self.read(SlotCount.count, row).lane.astype(jnp.int32) for row in rows]
+        counts = [self.read(SlotCount.count, at(row)).lane.astype(jnp.int32) for row in rows]
         self._counts = SlotCounts.of_rows([jnp.minimum(n, most) for n in counts], most)
         if self.set.gathers:
             self.write_empty(self.set.fields(), self.set.count - 1)
@@ -193,21 +156,19 @@ class BoundSlots(BoundContacts):
             self.table.write(name, lanes(values, shape, wide=True), item)
 
     def used(self, row: Any) -> jax.Array:
-        """Number of slots that any lane has filled, a scalar; within `only` any of its lanes."""
+        """Number of slots that any lane has filled, a scalar; see `masked`."""
         assert self._counts is not None
         return jnp.max(self._counts.of(row))
 
-    @contextlib.contextmanager
-    def only(self, busy: jax.Array) -> Iterator[None]:
-        """Within this context a pass goes through the slots that the lanes `busy` have filled.
+    def masked(self, busy: jax.Array) -> Self:
+        """The contacts whose passes go through the slots that the lanes `busy` have filled.
 
-        What it makes of other worlds is of no use.
+        What a pass makes of other worlds is of no use.
         """
-        before = self._counts
-        assert before is not None
-        self._counts = before.masked(busy)
-        yield
-        self._counts = before
+        assert self._counts is not None
+        among = copy.copy(self)
+        among._counts = self._counts.masked(busy)
+        return among
 
     def remembered(self, numbers: dict[str, Any]) -> dict[str, Lanes]:
         """Fields of the numbers, the same or different on the lanes, that the set remembers."""
@@ -223,14 +184,14 @@ class BoundSlots(BoundContacts):
         """One for lanes that had too few slots in any row, else zero, shape (lane,)."""
 
         def worst(row: jax.Array, most: jax.Array) -> jax.Array:
-            return jnp.maximum(most, self.read(SlotCount.count, row).lane)
+            return jnp.maximum(most, self.read(SlotCount.count, at(row)).lane)
 
         most = jax.lax.fori_loop(0, self.set.rows, worst, self.like)
         return jnp.where(most > self.set.slots, 1.0, 0.0).astype(self.like.dtype)
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
         """Gives contacts, with what is kept of them, a slot of a row on the lanes `which`."""
-        count = self.read(SlotCount.count, row).lane
+        count = self.read(SlotCount.count, at(row)).lane
         first = row * (self.set.slots + 1)
         filled = count.astype(jnp.int32)
         if not self.set.gathers:
@@ -238,7 +199,7 @@ class BoundSlots(BoundContacts):
             fresh = first + jnp.minimum(jnp.max(filled), self.set.slots)
             for field, value in fields.items():
                 away = lanewise(jnp.zeros_like, value) if field == "share" else value
-                self.write(field, away, fresh)
+                self.write(field, away, at(fresh))
         mine = jnp.where(which, jnp.minimum(filled, self.set.slots), self.set.slots)
         if self.set.gathers:
             for field, value in fields.items():
@@ -246,7 +207,7 @@ class BoundSlots(BoundContacts):
         else:
             self._fill(first, jnp.where(which, mine, -1), fields)
         more = jnp.where(which, count + 1.0, count)
-        self.write(SlotCount.count, lanes([more], (), wide=True), row)
+        self.write(SlotCount.count, lanes([more], (), wide=True), at(row))
 
     def _fill(self, first: Any, slot: jax.Array, fields: dict[str, Lanes]) -> None:
         """Stores the lanes' contacts, one slot after the other: vectors scatter slowly.
@@ -262,8 +223,8 @@ class BoundSlots(BoundContacts):
             chosen = left == now
             mask = lanes([chosen], (), wide=True)
             for field, value in fields.items():
-                before = self.read(field, first + now)
-                self.write(field, lanewise(jnp.where, mask, value, before), first + now)
+                before = self.read(field, at(first + now))
+                self.write(field, lanewise(jnp.where, mask, value, before), at(first + now))
             left = jnp.where(chosen, -1, left)
             return [jnp.max(left), left]
 
@@ -281,19 +242,19 @@ class BoundSlots(BoundContacts):
 
         return rebuild(jax.lax.while_loop(lambda c: c[0] < used, step, [jnp.int32(0), *arrays])[1:])
 
-    def _slot(self, row: Any, first: Any, k: jax.Array) -> UsedSlot:
+    def _slot(self, row: Any, first: Any, k: jax.Array) -> Item:
         """A row's k-th slot, behind the row's first item."""
         if not self.set.gathers:
-            return UsedSlot(first + k, first + k)
+            return Item(first + k, first + k)
         assert self._counts is not None
         mine = k < self._counts.of(row)
         item = jnp.full((self.set.size,), first + k, jnp.int32)
         # that of the first row
         empty = self.set.count - 1
         spare = self.set.slots
-        return UsedSlot(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
+        return Item(*(jnp.where(mine, item, jnp.int32(away)) for away in (empty, spare)))
 
-    def update_constraint(self, item: Any, place: Place, alpha: Lanes) -> Lanes:
+    def update_constraint(self, item: Item, place: Place, alpha: Lanes) -> Lanes:
         """Adds the last step to jar; stores the Hessian and returns the force, of one slot."""
         contacts = self.set.contacts
 
@@ -311,14 +272,6 @@ class BoundSlots(BoundContacts):
 
     def _zeros(self, *shapes: tuple[int, ...]) -> list[Lanes]:
         return [zeros(shape, self.like) for shape in shapes]
-
-
-@contextlib.contextmanager
-def only(sets: Sequence[BoundSlots], busy: jax.Array) -> Iterator[None]:
-    with contextlib.ExitStack() as stack:
-        for slots in sets:
-            stack.enter_context(slots.only(busy))
-        yield
 
 
 def any_of(which: jax.Array, then: Callable[[], None]) -> None:

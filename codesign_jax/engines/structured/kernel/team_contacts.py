@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import rows
 from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, choose, loop
+from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.rows import (
     Contact,
     Group,
@@ -25,7 +26,7 @@ from codesign_jax.engines.structured.kernel.self_contacts import (
     _times,
 )
 from codesign_jax.engines.structured.kernel.shared_memory import TEAM, TeamRows, ranks
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, UsedSlot
+from codesign_jax.engines.structured.kernel.slots import BoundSlots
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact
 from codesign_jax.scene import Scene
@@ -67,51 +68,46 @@ class BoundTeamSdfContacts(BoundSlots):
     def _lane(self) -> jax.Array:
         return self.block.column
 
-    def slot(self, k: Any) -> tuple[UsedSlot, jax.Array]:
-        """Items of the lanes in a round, and the rings that they are of."""
+    def item(self, k: Any) -> Item:
+        """Items of the lanes in a round, with the rings that they are of."""
         item, mine = self.block.dealt(self.set.rings, k)
         spare = self.set.rings + 1
-        return UsedSlot(jnp.where(mine, item, spare - 1), jnp.where(mine, item, spare)), item
+        return Item(jnp.where(mine, item, spare - 1), jnp.where(mine, item, spare), item)
 
     def begin_step(self) -> None:
         """Stores what lanes without an item read: no contact."""
         self.write_empty(self.set.groups(), self.set.rings)
 
-    def every(self, body: Callable, start: Any) -> Any:
-        """Folds body(item, rings, tree of lanes) over all items, a lane each."""
-        rounds = self.block.rounds(self.set.rings)
-        return loop(rounds, lambda k, carry: body(*self.slot(k), carry), start, self.set.size)
-
-    def each_item(self, body: Callable[[Any], None]) -> None:
+    def each_item(self, body: Callable[[Item], None]) -> None:
         """See `BoundContacts`; a lane each."""
 
-        def step(item: UsedSlot, _: Any, nothing: list) -> list:
+        def step(item: Item, nothing: list) -> list:
             body(item)
             return nothing
 
-        self.every(step, [])
+        self.fold_items(step, [])
 
     def fold_items(self, body: Callable, start: Any) -> Any:
         """See `BoundContacts`; a lane each."""
-        return self.every(lambda item, _, carry: body(item, carry), start)
+        rounds = self.block.rounds(self.set.rings)
+        return loop(rounds, lambda k, carry: body(self.item(k), carry), start, self.set.size)
 
-    def record(self, table: BoundTable, name: str, value: Lanes, item: UsedSlot) -> None:
+    def record(self, table: BoundTable, name: str, value: Lanes, item: Item) -> None:
         """See `BoundContacts`; a lane each."""
         table.scatter(name, value[..., 0, :, :], item.source, self.block.column)
 
     def update_constraints(self, alpha: Lanes) -> None:
         """Adds the last step of the line search to jar; stores Hessians and forces."""
 
-        def store(item: UsedSlot, _: Any, nothing: list) -> list:
+        def store(item: Item) -> None:
             def touches() -> None:
                 self.write(
                     TeamRing.force, self.update_constraint(item, self.place(item), alpha), item
                 )
 
             jax.lax.cond(self.touching(item), touches, lambda: None)
-            return nothing
 
-        self.every(store, [])
+        self.each_item(store)
 
     def columns(self, i: Any, k: int, unit: Lanes, forces: Lanes) -> Lanes:
         """The lanes' columns, (6,), of the sum of X'KX over the k contacts of link i.
@@ -128,7 +124,7 @@ class BoundTeamSdfContacts(BoundSlots):
             return sums + contact.contact_wrench(c, response)[:, 0]
 
         sums = self._zeros((6,))[0]
-        for item in (i * k + j for j in range(k)):
+        for item in (at(i * k + j) for j in range(k)):
 
             def add(item: Any = item, sums: Lanes = sums) -> Lanes:
                 kept = [self.read(name, item) for name in ("hessian", "force")]
@@ -141,14 +137,14 @@ class BoundTeamSdfContacts(BoundSlots):
     def prepare_all(self, self_contacts: BoundSelfContacts, k: int, obj: Lanes) -> Lanes:
         """`prepare_linesearch` of all items, k a link; slopes at 0, each on its lane."""
 
-        def add(item: UsedSlot, ring: jax.Array, sums: Lanes) -> Lanes:
-            row = jax.lax.div(ring, jnp.full_like(ring, k)) + 1
+        def add(item: Item, sums: Lanes) -> Lanes:
+            row = jax.lax.div(item.number, jnp.full_like(item.number, k)) + 1
             link_acc = self_contacts.table.gather(Side.link_acc, row, self.block.column)
             if self.set.on_object:
                 link_acc = lanewise(jnp.subtract, link_acc, obj)
             return lanewise(jnp.add, sums, self.prepare_linesearch(item, link_acc))
 
-        return self.every(add, self._zeros(())[0])
+        return self.fold_items(add, self._zeros(())[0])
 
 
 class TeamSelfContactSet(SelfContactSet):
@@ -184,34 +180,35 @@ class BoundTeamSelfContacts(BoundSelfContacts):
         """Rounds of a row."""
         return jax.lax.div(super().used(row) + (TEAM - 1), jnp.int32(TEAM))
 
-    def _slot(self, row: Any, first: Any, k: jax.Array) -> UsedSlot:
+    def _slot(self, row: Any, first: Any, k: jax.Array) -> Item:
         return self._item(row, first, k * TEAM + self.block.mate)
 
-    def _item(self, row: Any, first: Any, number: jax.Array) -> UsedSlot:
+    def _item(self, row: Any, first: Any, number: jax.Array) -> Item:
         assert self._counts is not None
         mine = number < self._counts.of(row)
         item = first + number
         empty = self.set.count - 1
         spare = self.set.slots
-        return UsedSlot(jnp.where(mine, item, empty), jnp.where(mine, item, spare))
+        return Item(jnp.where(mine, item, empty), jnp.where(mine, item, spare))
 
     def add(self, row: Any, which: jax.Array, fields: dict[str, Lanes], lane: jax.Array) -> None:
         """See `BoundSlots`; lanes of a team append in their order."""
         slots = self.set.slots
-        count = self.read(SlotCount.count, row).lane
+        count = self.read(SlotCount.count, at(row)).lane
         rank, number = ranks(self.block, which)
         mine = jnp.where(which, jnp.minimum(count.astype(jnp.int32) + rank, slots), slots)
         for field, value in fields.items():
             name = f"{self.set.name}.{field}"
             first = row * (slots + 1)
             self.table.scatter(name, value, first + mine, lane)
-        self.write(SlotCount.count, lanes([count + number.astype(count.dtype)], (), wide=True), row)
+        more = lanes([count + number.astype(count.dtype)], (), wide=True)
+        self.write(SlotCount.count, more, at(row))
 
     def own_side(self, item: Any) -> OwnSide:
         """See `BoundSelfContacts`; wrenches are added up later."""
         return OwnSide(self.place(item), None, None)
 
-    def load(self, item: UsedSlot, side: OwnSide, force: Lanes) -> None:
+    def load(self, item: Item, side: OwnSide, force: Lanes) -> None:
         """Keeps a slot's wrench, which is added to its side's when the pass has ended."""
         contacts = self.set.contacts
 

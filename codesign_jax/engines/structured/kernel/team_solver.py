@@ -21,6 +21,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     Shared,
     Side,
 )
+from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.shared_memory import (
     AGAIN,
     FORCES,
@@ -191,13 +192,12 @@ class TeamElimination(Elimination):
         unit = [jnp.where(self.block.mate == k, ones, 0.0) for k in range(6)]
         self.unit = lanes(unit, (6,), wide=True)
 
-    def backward(self, alpha: Lanes) -> tuple[Any, Lanes]:
+    def backward(self, alpha: Lanes, between: BoundSelfContacts | None) -> tuple[Any, Lanes]:
         """See `Elimination`; the node is the lanes' columns of P with r, C, and Q with r_o."""
         problem = self.problem
         team = self.team
-        self_contacts = self.problem.self_contacts
-        assert self_contacts is not None
-        self_contacts.update_constraints(alpha)
+        assert between is not None
+        between.update_constraints(alpha)
         for contacts in problem.per_link:
             contacts.update_constraints(alpha)  # type: ignore[attr-defined]
 
@@ -233,7 +233,7 @@ class TeamElimination(Elimination):
         none = zeros((6,), self.like)
         start = [none] * 3, zeros((), self.like)
         (p, c, q), work = loop(self.links, step, start, self.block.size, reverse=True)
-        first = self_contacts.wrench_on(0)
+        first = between.wrench_on(0)
         p = lanewise(add_link, p, team.forces, first, none)
         whole = self.block.fold(self.block.over_team(work.lane, jnp.add), jnp.add)
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
@@ -397,20 +397,22 @@ class TeamLineSearch(LineSearch):
         self.team = TeamLanes(problem)
         self.rings = problem.memory.layout.rings_per_link
 
-    def prepare(self, now: Iterate, step: Iterate) -> tuple[Lanes, Lanes, Lanes]:
+    def prepare(
+        self, now: Iterate, step: Iterate, between: BoundSelfContacts | None
+    ) -> tuple[Lanes, Lanes, Lanes]:
         """Substitutes back and prepares the line search.
 
         Args:
           now: The iterate.
           step: The Newton step of wrist, palm and object.
+          between: Contacts of the hand with itself that count.
 
         Returns:
           Slope and curvature of the smooth part, and the contacts' slope, all at 0, (1, world).
         """
         problem = self.problem
         team = self.team
-        self_contacts = self.problem.self_contacts
-        assert self_contacts is not None
+        assert between is not None
         palm, obj = (chosen(self.block, v) for v in (step.palm_acc, step.object_acc))
         first = team.as_lanes(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
 
@@ -436,13 +438,13 @@ class TeamLineSearch(LineSearch):
             )
             return team.as_lanes(part), sums
 
-        self_contacts.put(Side.link_acc, problem.widened(step.palm_acc), 0)
+        between.put(Side.link_acc, problem.widened(step.palm_acc), 0)
         start = team.as_lanes(palm + 0 * obj), [zeros((), self.like)] * 2
         _, (slope, curvature) = loop(self.links, link, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
-        terms = [lanewise(jnp.multiply, touch, first), self_contacts.prepare_all()]
+        terms = [lanewise(jnp.multiply, touch, first), between.prepare_all()]
         for contacts in problem.per_link:
-            terms.append(contacts.prepare_all(self_contacts, self.rings, step.object_acc))  # type: ignore[attr-defined]
+            terms.append(contacts.prepare_all(between, self.rings, step.object_acc))  # type: ignore[attr-defined]
         touch = lanewise(lambda t: total(t), terms)
         slope, curvature, touch = self.total([slope, curvature, touch])
         slope, curvature = lanewise(with_palm_and_object, now, step, problem.palm, slope, curvature)
@@ -452,11 +454,12 @@ class TeamLineSearch(LineSearch):
         """Sums of lanes over the teams of each world."""
         return self.block.sum([team_sum(self.block, v) for v in sums])
 
-    def contact_slopes(self, alpha: Lanes) -> list[Lanes]:
+    def contact_slopes(self, alpha: Lanes, between: BoundSelfContacts | None) -> list[Lanes]:
         """Slope and curvature of the contacts' cost along the step, sums of each finger's contacts.
 
         Args:
           alpha: Length of the step, lanes of a world.
+          between: Contacts of the hand with itself that count.
         """
         problem = self.problem
         sums = [zeros((), self.like)] * 2
@@ -466,13 +469,12 @@ class TeamLineSearch(LineSearch):
             return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
 
         for c in problem.dealt:
-            add = lambda i, s, c=c: plus(s, c.slopes(i, alpha))  # noqa: E731
-            sums = loop(c.set.count, add, sums, self.block.size)
+            sums = c.fold_items(lambda item, s, c=c: plus(s, c.slopes(item, alpha)), sums)
         sums = [lanewise(jnp.multiply, v, first) for v in sums]
         for c in problem.per_link:
-            sums = c.every(lambda item, _, s, c=c: plus(s, c.slopes(item, alpha)), sums)  # type: ignore[attr-defined]
-        assert problem.self_contacts is not None
-        return problem.self_contacts.slopes_of_all(alpha, sums)
+            sums = c.fold_items(lambda item, s, c=c: plus(s, c.slopes(item, alpha)), sums)
+        assert between is not None
+        return between.slopes_of_all(alpha, sums)
 
 
 def team_rows(stored: dict[str, Lanes], body: tuple) -> dict[str, Lanes]:

@@ -103,6 +103,8 @@ def measure(everything: dict[str, Scene], path: Path, *, commit: str | None, qui
     results: dict[str, Any] = {"designs": designs, "trials": trials, "effects": {}}
     results["intervals"] = "over designs and trials"
     results["provenance"] = provenance.measurement(commit)
+    # Processes that are bound to some of the cores leave the others to other programs.
+    results["machine_cpus"] = os.cpu_count()
     worlds = grasps(everything[AS_IT_IS], designs, trials)
     few = jax.tree.map(lambda v: np.asarray(v)[: TIMED * trials], worlds)
     programs = {}
@@ -166,8 +168,9 @@ def measured(results: dict[str, Any]) -> str:
     load = results["load"]
     caption = (
         f"{results['designs']} designs in {results['trials']} trials each; intervals of success "
-        f"{results.get('intervals', 'as if all grasps were independent')}; {p['cpus']} cores, jax "
-        f"{p['jax']}; timed while other programs used the machine (load average {max(load):.0f})."
+        f"{results['intervals']}; {p['cpus']} of the machine's {results['machine_cpus']} cores, "
+        f"jax {p['jax']}; timed while other programs used the machine (load average "
+        f"{max(load):.0f})."
     )
     return f"{caption}\n\n{output.markdown(table)}"
 

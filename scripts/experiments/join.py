@@ -34,16 +34,18 @@ def join(parts: list[results.Study]) -> tuple[simulate.Arrays, dict[str, Any]]:
         if {k: v for k, v in part.plan.items() if k != "runs"} != whole:
             raise ValueError(f"{part.plan} is no part of {whole}")
         if part.notes["settings"]["seed"] != seed:
-            raise ValueError(f"a part begins with seed {part.notes['settings']['seed']}, not {seed}")
+            raise ValueError(
+                f"a part begins with seed {part.notes['settings']['seed']}, not {seed}"
+            )
         seed += part.plan["runs"]
     runs = sum(part.plan["runs"] for part in parts)
     notes["settings"] = notes["settings"] | {"plan": parts[0].plan | {"runs": runs}}
     others = [{k: v for k, v in part.notes.items() if k != "parts"} for part in parts[1:]]
     notes["parts"] = [*parts[0].notes.get("parts", ()), *others]
     arrays = {}
-    for name, first in parts[0].data.items():
+    for name, values in parts[0].data.items():
         if name in COMMON:
-            arrays[name] = first
+            arrays[name] = values
             continue
         axis = 0 if name in BY_RUN else 1
         arrays[name] = np.concatenate([part.data[name] for part in parts], axis)

@@ -19,10 +19,10 @@ import pytest
 from codesign_jax.engines.structured import coordinates
 from codesign_jax.engines.structured.forces import forces
 from codesign_jax.engines.structured.kernel import memory_tables
-from codesign_jax.engines.structured.kernel.placement import at
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
+from codesign_jax.engines.structured.kernel.placement import SlotCounts, at
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
-from codesign_jax.engines.structured.kernel.slots import BoundSlots, SlotCounts
+from codesign_jax.engines.structured.kernel.sides import Sides
 from codesign_jax.engines.structured.lanewise import lanes, lanewise, of_code
 from codesign_jax.engines.structured.laws import inertia
 from codesign_jax.engines.structured.laws.rings import Place
@@ -60,7 +60,7 @@ LINK = "load_link"
 ADD = "_add"
 NEXT = "next acceleration"
 """A check of the second step, of a fault in what the first one leaves."""
-TIMES = "_times"
+TIMES = "symmetric_times"
 AGAIN = "_again"
 PALM_AGAIN = "solve_palm_again"
 
@@ -119,8 +119,9 @@ def added(*fields):
     return Fault({ADD: stage})
 
 
-def first_only(right, mine, self, row, which, fields, lane):
-    right(self, row, which & ~(mine & (self.read("count", at(row)).lane > 0)), fields, lane)
+def first_only(right, mine, self, row, which, fields):
+    """The first contact of a row alone gets a slot."""
+    right(self, row, which & ~(mine & (self.read("count", at(row)).lane > 0)), fields)
 
 
 def not_emptied(right, mine, self, row):
@@ -137,16 +138,16 @@ def no_flag(right, mine, self):
     return jnp.where(mine, 0 * flag, flag)
 
 
-def own_half(right, mine, self, item):
+def own_half(right, mine, self, contacts, item):
     """A relative motion without the other side's part."""
-    motion = right(self, item)
+    motion = right(self, contacts, item)
     return chosen(mine, lanewise(lambda m: 0.5 * m, motion), motion)
 
 
-def one_side(right, mine, self, item, field, more, *rest):
+def one_side(right, mine, self, contacts, item, field, more, *rest):
     """A finger does not feel the other side of its contact with itself, nor the palm fingers."""
     left = chosen(mine, lanewise(lambda m: 0 * m, more), more) if field == "other" else more
-    right(self, item, field, left, *rest)
+    right(self, contacts, item, field, left, *rest)
 
 
 def pulled(right, *args):
@@ -196,15 +197,13 @@ PAIRS = {
         {"free_of_palm": lambda f, *a: 0 * f(*a) + 1}, check=SHORT
     ),
     # contacts between fingers, with spheres and with rings
-    "both fingers are pushed the same way": Fault(
-        {}, methods={(BoundSelfContacts, "enter"): same_way}
-    ),
-    "contacts act on the link before": Fault({}, methods={(BoundSelfContacts, "enter"): on_parent}),
+    "both fingers are pushed the same way": Fault({}, methods={(ContactList, "enter"): same_way}),
+    "contacts act on the link before": Fault({}, methods={(ContactList, "enter"): on_parent}),
     "the other finger does not feel the contact": Fault(
         {LOAD: lambda f, *a: jnp.zeros_like(f(*a))}, finger=1
     ),
     "links do not feel contacts between fingers": Fault({LINK: without_pairs}),
-    "relative motion of one side": Fault({}, methods={(BoundSelfContacts, "relative"): own_half}),
+    "relative motion of one side": Fault({}, methods={(Sides, "relative"): own_half}),
     "half the Hessian between fingers": Fault({TIMES: lambda f, *a: 0.5 * f(*a)}),
     "conjugate gradients without forces on the object": Fault({PALM_AGAIN: without_last}),
     "conjugate gradients without forces on links": Fault({AGAIN: without_last}),
@@ -231,9 +230,7 @@ HULL = {
     "gaps close when they are half as wide": Fault({CANDIDATES: half_gap}),
     "a line search of one stiffness": Fault({RAY: one_stiffness, SLOPES: one_stiffness}),
     # one lane with both sides
-    "one side of a contact alone": Fault(
-        {}, methods={(BoundSelfContacts, "_add_wrench"): one_side}
-    ),
+    "one side of a contact alone": Fault({}, methods={(Sides, "_add_wrench"): one_side}),
     "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
     # state
     "fingers hold nothing": Fault({HELD: lambda f, jar, *rest: jar}, later=True),
@@ -243,22 +240,22 @@ HULL = {
     "rings hold the other way": Fault({RINGS_HOLD: lambda f, *a: -f(*a)}, NEXT),
     "what rings hold does not turn": Fault({TURN: lambda f, columns, hold: hold}, later=True),
     # slots
-    "a pairing has one slot": Fault({}, methods={(BoundSlots, "add"): first_only}),
+    "a pairing has one slot": Fault({}, methods={(ContactList, "append"): first_only}),
     "a slot of the step before": Fault(
-        {}, methods={(BoundSlots, "clear"): not_emptied}, later=True
+        {}, methods={(ContactList, "clear"): not_emptied}, later=True
     ),
     # where lanes gather; others pass through the slots of their block's other worlds as well
     "a world that iterates is passed over": Fault(
         {}, methods={(SlotCounts, "masked"): passed_over}
     ),
-    "no flag for too few slots": Fault({}, "overflow", methods={(BoundSlots, "overflow"): no_flag}),
+    "no flag for too few slots": Fault(
+        {}, "overflow", methods={(ContactList, "overflow"): no_flag}
+    ),
     **PAIRS,
 }
 SPHERES = {
     "the palm pulls": Fault({"ball_on_field": pulled}),
-    "the palm does not feel fingers": Fault(
-        {}, methods={(BoundSelfContacts, "_add_wrench"): one_side}
-    ),
+    "the palm does not feel fingers": Fault({}, methods={(Sides, "_add_wrench"): one_side}),
     "the palm rubs as fingers do": cone_of("finger_palm", "finger_finger"),
     "contacts between spheres in the centre": place(BALLS, point=lambda v: 0.9 * v),
     "spheres half as deep": place(BALLS, gap=lambda v: 0.5 * v),

@@ -15,7 +15,7 @@ from codesign_jax import model
 from codesign_jax.engines import depths
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.engines.structured import coordinates
-from codesign_jax.engines.structured.kernel.contact_sets import margin
+from codesign_jax.engines.structured.kernel.contact_list import margin
 from codesign_jax.engines.structured.lanes import dot, once, scan_links
 from codesign_jax.engines.structured.laws import surroundings
 from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone

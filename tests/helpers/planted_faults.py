@@ -18,15 +18,15 @@ import pytest
 from codesign_jax import reuse
 from codesign_jax.engines.structured import StructuredEngine
 from codesign_jax.engines.structured.kernel import Limits, Program, program, step
-from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
+from codesign_jax.engines.structured.kernel.contact_list import ContactLayout
 from codesign_jax.engines.structured.lanewise import lanes, lanewise
 from codesign_jax.engines.structured.world_model import world_constants
 
 FAR = 1e30
 DEEP = 1e6
 """Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
-NAMES = "chambers contact_sets coupling self_collision self_contacts friction_memory"
-NAMES += " linear_system newton problem ring_pairs sdf_collision slots step"
+NAMES = "chambers contact_list coupling self_collision sides friction_memory"
+NAMES += " linear_system newton problem ring_pairs sdf_collision placement step"
 MODULES = [import_module(f"{step.__package__}.{name}") for name in NAMES.split()]
 
 
@@ -59,13 +59,13 @@ def chosen(mine, wrong, right, *, wide=True):
 def cone_of(name, other):
     """Contacts of a pair of bodies have the friction cone of another pair."""
 
-    def cone(right, mine, self, read, pair=""):
+    def cone(right, mine, self, read, pair):
         sound = right(self, read, pair)
-        if (pair or self.name) != name:
+        if pair != name:
             return sound
         return chosen(mine, right(self, read, other), sound, wide=False)
 
-    return Fault({}, methods={(ContactSet, "cone"): cone})
+    return Fault({}, methods={(ContactLayout, "cone"): cone})
 
 
 class Planted:

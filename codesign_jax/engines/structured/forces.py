@@ -56,11 +56,11 @@ def contact_energy(scene: Scene, hand: WorldModel, state: State, pressure: jax.A
     program, out = _of_states(scene, hand, state, pressure, Record(energy=True))
     recorded = program.by_name(out.recorded, state.wrist.shape[-1])
     total = jnp.zeros_like(state.wrist[0, 0])
-    for contacts in program.sets:
+    for contacts in program.lists:
         energy = recorded[f"{contacts.name}.energy"]
-        if (pairs := program.self_set) is not None and contacts is pairs:
+        if contacts.of_hand:
             # Both fingers of a pair have the contact; rows of a finger with itself have it once.
-            single = np.arange(pairs.rows) < pairs.with_itself
+            single = np.arange(contacts.slots.rows) < contacts.with_itself
             energy = energy * np.where(single, 1.0, 0.5)[:, None, None]
         total = total + energy.reshape(len(total), -1).sum(1)
     return total
@@ -118,7 +118,7 @@ def _summed(program: Program, recorded: Recorded, none: jax.Array) -> Forces:
     def of_body(name: str) -> jax.Array:
         return net(name).sum(-1)
 
-    fields = [s.name for s in program.sets if s is not program.self_set]
+    fields = [c.name for c in program.lists if not c.of_hand]
     depth = {name: recorded[f"{name}.depth"].max((2, 3)) for name in fields}
     between, on_palm, more = _between_fingers(program, recorded, none)
     grip = recorded.get("finger_object.pressing", vector[:, :, :, 0])[:, :, 0]
@@ -149,10 +149,10 @@ def _between_fingers(
     pressing = recorded.get("finger_finger.pressing")  # (world, time, row, 2, finger)
     if pressing is None:
         return between, none, {}
-    self_contacts = program.self_set
+    self_contacts = program.self_list
     assert self_contacts is not None
     finger = np.arange(lanes)
-    for row in range(self_contacts.rows):
+    for row in range(self_contacts.slots.rows):
         partner = finger ^ (row + self_contacts.first)
         between = between.at[:, :, finger, partner].set(pressing[:, :, row, 0])
     deepest = recorded["finger_finger.depth"].max(4)

@@ -105,7 +105,7 @@ class AdjointProgram(Program):
     def _tables(self) -> None:
         super()._tables()
         more = self._groups(Chain, ChainBefore, Virtual)
-        for contacts in self.sets:
+        for contacts in self.lists:
             more |= contacts.groups_of(HeldBar)
         more |= self._groups(StepBar, BodyBar)
         self.scratch = MemoryLayout.by_item(True, **(self.scratch.groups | more))

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, residual
 from codesign_jax.engines.structured.kernel import elimination as el
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.contacts_vjp import ContactsVjp
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.coupling import Coupling
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
-from codesign_jax.engines.structured.kernel.memory import Block, choose, loop
+from codesign_jax.engines.structured.kernel.memory import Block, any_of, choose, loop, zeros
 from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.residual import Before, LinkMotion
@@ -32,8 +32,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     Virtual,
     WorldState,
 )
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
-from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.kernel.sides import Sides
 from codesign_jax.engines.structured.kernel.step import Step, body_after_step, joint_after_step
 from codesign_jax.engines.structured.kernel.step_memory import (
     KernelLayout,
@@ -234,17 +233,18 @@ class AdjointSolve(Elimination):
         smooth, right = self.problem.read(Scratch.smooth, Virtual.acc_bar, item=i)
         return [_none(smooth), right]
 
-    def of_contacts(self, contacts: BoundContacts, item: Item, alpha: Lanes) -> tuple[Lanes, Lanes]:
+    def of_contacts(self, contacts: ContactList, item: Item, alpha: Lanes) -> tuple[Lanes, Lanes]:
         matrix, wrench = contacts.inertia_and_wrench(item, alpha)
-        if contacts.set.holds:
+        if contacts.layout.holds:
             return matrix, friction_memory.wrench_of_cotangents(self.problem, contacts, item)
         return matrix, _none(wrench)
 
-    def between_fingers(self, self_contacts: BoundSelfContacts, alpha: Lanes) -> None:
-        self_contacts.update_constraints(alpha)
-        self_contacts.clear_wrenches()
+    def between_fingers(self, sides: Sides, between: ContactList, alpha: Lanes) -> None:
+        sides.update_constraints(between, alpha)
         if friction_memory.pairings(self.problem.memory):
-            friction_memory.load_cotangents(self.problem, self_contacts)
+            friction_memory.load_cotangents(self.problem, sides, between)
+        else:
+            sides.clear()
 
     def solve(self) -> Iterate:
         """Virtual accelerations of the wrist, and those of palm and object.

@@ -18,9 +18,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, pull
-from codesign_jax.engines.structured.kernel.memory import loop, upper
+from codesign_jax.engines.structured.kernel.memory import loop, upper, zeros
 from codesign_jax.engines.structured.kernel.rows import (
     Again,
     Air,

@@ -13,10 +13,12 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, kinds, objects
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.kinds import KINDS, BodyMotion, CentreLine
+from codesign_jax.engines.structured.kernel.memory import any_of, zeros
 from codesign_jax.engines.structured.kernel.objects import WorldObject
+from codesign_jax.engines.structured.kernel.pairing import FingerPairing
 from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate
 from codesign_jax.engines.structured.kernel.rows import (
@@ -32,8 +34,6 @@ from codesign_jax.engines.structured.kernel.rows import (
     World,
 )
 from codesign_jax.engines.structured.kernel.self_collision import neighbours
-from codesign_jax.engines.structured.kernel.self_contacts import FingerPairing
-from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step import Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
@@ -89,15 +89,15 @@ class ContactsVjp:
         """
         self._clear()
         if (self_contacts := self.step.self_contacts) is not None:
-            self_contacts.each_item(self._slot)
+            self_contacts.each(self._slot)
         for contacts in self.step.field_contacts:
-            reverse = self._points if contacts.set.name == "object_table" else self._rings
-            contacts.each_item(partial(self._where_touching, contacts, reverse))
+            reverse = self._points if contacts.layout.name == "object_table" else self._rings
+            contacts.each(partial(self._where_touching, contacts, reverse))
         if self.layout.grows:
             self._add_growth(pressure)
 
     @staticmethod
-    def _where_touching(contacts: BoundContacts, reverse: Callable, item: Item) -> None:
+    def _where_touching(contacts: ContactList, reverse: Callable, item: Item) -> None:
         jax.lax.cond(contacts.touching(item), lambda: reverse(contacts, item), lambda: None)
 
     # What a side has, and what is left for it
@@ -163,10 +163,10 @@ class ContactsVjp:
 
     # Contacts with a fixed place
 
-    def _rings(self, contacts: BoundContacts, item: Item) -> None:
+    def _rings(self, contacts: ContactList, item: Item) -> None:
         """Adds the cotangents of an item's contacts, of the rings of a link or of the palm."""
         i = item.number
-        name = contacts.set.name
+        name = contacts.layout.name
         of_palm = name.startswith("palm")
         row = self.palm_row if of_palm else i + 1
         k = 1 if of_palm else self.layout.rings_per_link
@@ -186,7 +186,7 @@ class ContactsVjp:
             else:
                 self.add_ring(bar, i * k + j)
 
-    def _points(self, contacts: BoundContacts, item: Item) -> None:
+    def _points(self, contacts: ContactList, item: Item) -> None:
         """The same of the object's points on table and fixtures that an item deals to the lanes."""
         point = self.step.block.finger + item.number * self.layout.fingers
         fixed = self.fixed | {"point": self._float(point)}
@@ -198,7 +198,7 @@ class ContactsVjp:
 
     def _reverse_item(
         self,
-        contacts: BoundContacts,
+        contacts: ContactList,
         item: Item,
         mine: tuple,
         numbers: dict[str, Lanes],
@@ -211,10 +211,10 @@ class ContactsVjp:
         """
         fixed = fixed | {Contact.share: contacts.read(Contact.share, item)}
         held = {}
-        if contacts.set.holds:
+        if contacts.layout.holds:
             held = {Contact.held: contacts.read(Contact.held, item)}
             fixed |= {HeldBar.held_bar: contacts.read(HeldBar.held_bar, item)}
-        run = partial(kinds.power, self.layout.scene, contacts.set.name)
+        run = partial(kinds.power, self.layout.scene, contacts.layout.name)
         mine, _, bars, held_bars = pull(run, (mine, (), numbers, held), (fixed,), self.power_bar)
         friction_memory.add_held(self.bars, contacts, item, held_bars)
         return mine, bars

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from codesign_jax.engines.structured.components import FINGER, is_number, splat
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
+from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout, zeros
 from codesign_jax.engines.structured.kernel.rows import StepBar
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout, References
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise

@@ -24,14 +24,12 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import anywhere, loop
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
+from codesign_jax.engines.structured.kernel.memory import anywhere, loop, zeros
 from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem
 from codesign_jax.engines.structured.kernel.rows import Again, Scratch, Side, Slot
-from codesign_jax.engines.structured.kernel.self_contacts import (
-    BoundSelfContacts,
-)
+from codesign_jax.engines.structured.kernel.sides import OwnSide
 from codesign_jax.engines.structured.lanes import contract, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -60,13 +58,15 @@ class Coupling:
     def __init__(
         self,
         problem: Problem,
-        self_contacts: BoundSelfContacts,
+        self_contacts: ContactList,
         done: Eliminated,
         *,
         tolerance: float = TOLERANCE,
         iterations: int = ITERATIONS,
     ):
         self.problem = problem
+        assert problem.sides is not None
+        self.sides = problem.sides
         self.contacts = self_contacts
         self.done = done
         self.tolerance = tolerance
@@ -121,12 +121,10 @@ class Coupling:
     def _begin(self, busy: Lanes) -> None:
         """Stores the first residual, and the relative accelerations by the uncorrected step."""
         contacts = self.contacts
-        contacts.clear_wrenches()
 
-        def store(item: Item) -> None:
-            side = contacts.own_side(item)
+        def store(item: Item, _: OwnSide) -> Lanes:
             hessian = contacts.read(Slot.hessian, item)
-            change = contacts.relative(item)
+            change = self.sides.relative(contacts, item)
             residual = lanewise(
                 lambda b, f: jnp.where(b, -f, 0.0), busy, contacts.times_hessian(hessian, change)
             )
@@ -135,11 +133,11 @@ class Coupling:
             fields |= {Slot.direction: none, Slot.direction_response: none, Slot.force: none}
             for field, value in fields.items():
                 contacts.write(field, value, item)
-            contacts.load(item, side, residual)
+            return residual
 
-        contacts.each_item(store)
+        self.sides.lay_each(contacts, store)
 
-    def _products(self, contacts: BoundSelfContacts) -> tuple[jax.Array, jax.Array]:
+    def _products(self, contacts: ContactList) -> tuple[jax.Array, jax.Array]:
         """Applies P^-1 J' to the residual of contacts, and J to that: "response".
 
         Returns the product of the residual with it, and its curvature, shape (lane,) each.
@@ -149,7 +147,7 @@ class Coupling:
         def add(item: Item, sums: list[Lanes]) -> list[Lanes]:
             residual = contacts.read(Slot.residual, item)
             hessian = contacts.read(Slot.hessian, item)
-            response = contacts.relative(item)
+            response = self.sides.relative(contacts, item)
             contacts.write(Slot.response, response, item)
 
             def both(sums, half, residual, response, force):
@@ -165,18 +163,15 @@ class Coupling:
                 contacts.times_hessian(hessian, response),
             )
 
-        sums = contacts.fold_items(add, [zeros((), self.problem.like)] * 2)
+        sums = contacts.fold(add, [zeros((), self.problem.like)] * 2)
         size, bent = (self.block.total(v.lane) for v in sums)
         return size, bent
 
-    def _advance(
-        self, contacts: BoundSelfContacts, length: jax.Array, turn: jax.Array
-    ) -> jax.Array:
+    def _advance(self, contacts: ContactList, length: jax.Array, turn: jax.Array) -> jax.Array:
         """Turns the direction of contacts and goes along it; returns what that gains of the work.
 
         The new residual is laid on the sides.
         """
-        contacts.clear_wrenches()
         alpha, beta = (lanes([v], (), wide=False) for v in (length, turn))
         names = (
             Slot.residual,
@@ -193,7 +188,7 @@ class Coupling:
             return direction, direction_response, force, residual - alpha * direction
 
         def store(item: Item, gain: Lanes) -> Lanes:
-            side = contacts.own_side(item)
+            side = self.sides.own_side(contacts, item)
             hessian = contacts.read(Slot.hessian, item)
             old = [contacts.read(name, item) for name in names]
             first_response = contacts.read(Slot.first_response, item)
@@ -204,28 +199,25 @@ class Coupling:
             new |= {Slot.direction_response: direction_response, Slot.force: force}
             for name, value in new.items():
                 contacts.write(name, value, item)
-            contacts.load(item, side, residual)
+            self.sides.load(contacts, item, side, residual)
 
             def add(gain, half, direction, first_response):
                 return gain + half * sum_axis(dot(direction, first_response), 0)
 
             return lanewise(add, gain, item.pairing.half, direction, first_response)
 
-        gain = contacts.fold_items(store, zeros((), self.problem.like))
+        gain = self.sides.lay(contacts, store, zeros((), self.problem.like))
         return self.block.total(gain.lane)
 
     def _result(self, kept: Lanes) -> Iterate:
         """Solves once more, with the sum of all steps; where that is no descent, without it."""
         contacts = self.contacts
-        contacts.clear_wrenches()
 
-        def store(item: Item) -> None:
-            value = lanewise(
-                lambda k, s: jnp.where(k, s, 0.0), kept, contacts.read(Slot.force, item)
-            )
-            contacts.load(item, contacts.own_side(item), value)
+        def store(item: Item, _: OwnSide) -> Lanes:
+            force = contacts.read(Slot.force, item)
+            return lanewise(lambda k, s: jnp.where(k, s, 0.0), kept, force)
 
-        contacts.each_item(store)
+        self.sides.lay_each(contacts, store)
         return self.again()
 
     # One more right side
@@ -240,7 +232,7 @@ class Coupling:
 
         def step(i: Any, carry: tuple) -> tuple:
             names = (Scratch.axes, Scratch.w, Scratch.g, Again.inverse)
-            push = self.contacts.wrench_on(i + 1)
+            push = self.sides.wrench_on(i + 1)
             factors = self.problem.read(*names, item=i)
             r, ro, z = lanewise(_again, carry, factors, push)
             self.problem.write(Again.z_again, z, i)
@@ -274,11 +266,11 @@ class Coupling:
                 return el.substitute(axes, el.Factors(*factors), parent, obj)[1]
 
             moved = lanewise(move, axes, factors, parent, step.object_acc)
-            self.contacts.put(Side.link_acc, moved, i + 1)
+            self.sides.put(Side.link_acc, moved, i + 1)
             return moved
 
         parent = self.problem.widened(step.palm_acc)
-        self.contacts.put(Side.link_acc, parent, 0)
+        self.sides.put(Side.link_acc, parent, 0)
         loop(self.links, link, parent, self.block.size)
 
 

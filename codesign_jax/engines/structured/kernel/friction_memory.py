@@ -21,18 +21,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_list import ContactList, make_contacts
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
-from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
+from codesign_jax.engines.structured.kernel.memory import any_of, tree_add_scaled, zeros
+from codesign_jax.engines.structured.kernel.pairing import FingerPairing
 from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import Problem
 from codesign_jax.engines.structured.kernel.rows import Contact, HeldBar, Scratch, Slot, Virtual
-from codesign_jax.engines.structured.kernel.self_contacts import (
-    BoundSelfContacts,
-    FingerPairing,
-)
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
-from codesign_jax.engines.structured.kernel.slots import any_of
+from codesign_jax.engines.structured.kernel.sides import OwnSide, Sides
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -51,28 +48,26 @@ def pairings(step: StepMemory) -> int:
     return step.layout.held.get("finger_finger", 0)
 
 
-def held_by_pairing(step: StepMemory, self_contacts: BoundSelfContacts, row: Any) -> list[Lanes]:
+def held_by_pairing(step: StepMemory, self_contacts: ContactList, row: Any) -> list[Lanes]:
     """What the fingers of a pairing's row hold, (3,) or nothing if the scene has no such state."""
     if not pairings(step):
         return []
-    return [step.finger_state.read(BETWEEN_FINGERS, row + self_contacts.set.first)]
+    return [step.finger_state.read(BETWEEN_FINGERS, row + self_contacts.layout.first)]
 
 
-def held_by_item(
-    step: StepMemory, contacts: BoundContacts, item: Item
-) -> tuple[Lanes, Lanes] | None:
+def held_by_item(step: StepMemory, contacts: ContactList, item: Item) -> tuple[Lanes, Lanes] | None:
     """What an item's contacts hold, (3, k): along the world's axes, and as the state has it."""
-    if not contacts.set.holds:
+    if not contacts.layout.holds:
         return None
-    name = f"held.{contacts.set.name}"
+    name = f"held.{contacts.layout.name}"
     if jnp.ndim(item.number):
         row = step.finger_state.gather(name, item.number, step.block.column)
         held_friction = lanewise(lambda v: v[:, None], row)
     else:
-        k = contacts.set.k
+        k = contacts.layout.k
         rows = [step.finger_state.read(name, item.number * k + j) for j in range(k)]
         held_friction = lanewise(lambda rows: jnp.stack(rows, 1), rows)
-    if not contacts.set.on_object:
+    if not contacts.layout.on_object:
         return held_friction, held_friction
     return lanewise(in_world, step.columns, held_friction), held_friction
 
@@ -97,15 +92,15 @@ def store(step: StepMemory, good: jax.Array) -> None:
         old = state.read(BETWEEN_FINGERS, item)
         state.write(BETWEEN_FINGERS, lanewise(jnp.where, mask, new, old), item)
     for contacts in step.contacts.values():
-        if contacts.set.holds:
+        if contacts.layout.holds:
             _store(step, contacts, mask)
 
 
-def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
+def _store(step: StepMemory, contacts: ContactList, mask: Lanes) -> None:
     """Ends a step of a set's contacts; what does not touch holds nothing."""
-    name = f"held.{contacts.set.name}"
+    name = f"held.{contacts.layout.name}"
     state = step.finger_state
-    k = contacts.set.k
+    k = contacts.layout.k
 
     def after(mask: jax.Array, share: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(mask, jnp.where(share > 0, new, 0.0), old)
@@ -118,32 +113,31 @@ def _store(step: StepMemory, contacts: BoundContacts, mask: Lanes) -> None:
             state.write(name, lanewise(after, mask, share[j], new[:, j], old), item * k + j)
         return x
 
-    jax.lax.fori_loop(0, step.layout.held[contacts.set.name] // k, store_item, jnp.int32(0))
+    jax.lax.fori_loop(0, step.layout.held[contacts.layout.name] // k, store_item, jnp.int32(0))
 
 
-def sums(self_contacts: BoundSelfContacts, row: Any, alpha: Lanes, held_friction: Lanes) -> Lanes:
+def sums(self_contacts: ContactList, row: Any, alpha: Lanes, held_friction: Lanes) -> Lanes:
     """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
-    contacts = self_contacts.set.contacts
 
     def add(sums, place, cone, alpha, jar, step, held_friction, counts):
-        c = contacts(place, cone)
+        c = make_contacts(place, cone)
         force = contact.constraint_update(c, tree_add_scaled(alpha, jar, step)).force
         return sums + counts * sum_axis(holding.hold(c, force, held_friction[:, None]), 1)
 
     def slot(item: Item, sums: Lanes) -> Lanes:
         jar = self_contacts.read(Contact.jar, item)
         step = self_contacts.read(Contact.step, item)
-        counts = self_contacts.holds(item)
+        counts = self_contacts.held_part(item)
         contact_numbers = self_contacts.place(item), self_contacts.cone_at(item)
         return lanewise(add, sums, *contact_numbers, alpha, jar, step, held_friction, counts)
 
-    added = self_contacts.fold(row, slot, zeros((4,), self_contacts.like))
+    added = self_contacts.fold_row(row, slot, zeros((4,), self_contacts.like))
     return added if self_contacts.block.team == 1 else team_sum(self_contacts.block, added)
 
 
 def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     """Keeps what contacts of worlds hold whose iteration ends with a step of this length."""
-    some = [c for c in (*problem.per_link, *problem.dealt) if c.set.holds]
+    some = [c for c in (*problem.per_link, *problem.dealt) if c.layout.holds]
 
     def keep_all() -> None:
         for contacts in some:
@@ -155,13 +149,12 @@ def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         _keep_of_fingers(problem, alpha, which)
 
 
-def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: Lanes) -> None:
+def _keep_of_set(problem: Problem, contacts: ContactList, alpha: Lanes, mask: Lanes) -> None:
     """Keeps what a set's contacts hold behind the step, in the worlds of the mask."""
-    build = contacts.set.contacts
     axes = held_axes(problem.memory, contacts)
 
     def after(mask, place, cone, alpha, jar, step, old, axes):
-        new = behind(build(place, cone), jar + alpha * step, old, axes)
+        new = behind(make_contacts(place, cone), jar + alpha * step, old, axes)
         return jnp.where(mask, new, old)
 
     def keep_item(item: Item) -> None:
@@ -176,12 +169,12 @@ def _keep_of_set(problem: Problem, contacts: BoundContacts, alpha: Lanes, mask: 
 
         jax.lax.cond(contacts.touching(item), store, lambda: None)
 
-    contacts.each_item(keep_item)
+    contacts.each(keep_item)
 
 
-def held_axes(step: StepMemory, contacts: BoundContacts) -> Lanes | None:
+def held_axes(step: StepMemory, contacts: ContactList) -> Lanes | None:
     """Columns of the axes along which contacts hold, None for the world's."""
-    return step.columns if contacts.set.on_object else None
+    return step.columns if contacts.layout.on_object else None
 
 
 def behind(
@@ -207,7 +200,7 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
     def keep_all() -> None:
         mask = lanes([which], (), wide=True)
-        first = self_contacts.set.first
+        first = self_contacts.layout.first
 
         def keep_row(row: jax.Array, x: jax.Array) -> jax.Array:
             before, old = problem.read(BETWEEN_FINGERS, Scratch.new_held_friction, item=row + first)
@@ -217,7 +210,7 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
             )
             return x
 
-        jax.lax.fori_loop(0, self_contacts.set.rows, keep_row, jnp.int32(0))
+        jax.lax.fori_loop(0, self_contacts.layout.slots.rows, keep_row, jnp.int32(0))
 
     any_of(which & among.touching_worlds(), keep_all)
 
@@ -229,14 +222,14 @@ def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
     before a step of which contacts add their part.
     """
     for contacts in step.contacts.values():
-        if contacts.set.holds:
+        if contacts.layout.holds:
             _reverse(step, bars, contacts, go)
     if pairings(step):
         assert step.self_contacts is not None
         _reverse_fingers(step, bars, step.self_contacts, go)
 
 
-def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, go: Lanes) -> None:
+def _reverse(step: StepMemory, bars: CotangentTables, contacts: ContactList, go: Lanes) -> None:
     """Leaves the cotangents of a set's contacts as "held_bar"."""
     rest = lanewise(jnp.logical_not, go)
 
@@ -245,44 +238,43 @@ def _reverse(step: StepMemory, bars: CotangentTables, contacts: BoundContacts, g
         contacts.write(HeldBar.held_bar, only_on(go, held_bar), item)
         _write_bars(bars, contacts, item, only_on(rest, held_bar))
 
-    contacts.each_item(reverse_item)
+    contacts.each(reverse_item)
 
 
-def held_bars(bars: CotangentTables, contacts: BoundContacts, item: Item) -> Lanes:
+def held_bars(bars: CotangentTables, contacts: ContactList, item: Item) -> Lanes:
     """Cotangents of what an item's contacts hold, (3, k)."""
-    name = f"held.{contacts.set.name}"
-    k = contacts.set.k
+    name = f"held.{contacts.layout.name}"
+    k = contacts.layout.k
     rows = [bars.finger_state.read(name, item.number * k + j) for j in range(k)]
     return lanewise(lambda rows: jnp.stack(rows, 1), rows)
 
 
-def _write_bars(bars: CotangentTables, contacts: BoundContacts, item: Item, value: Lanes) -> None:
-    name = f"held.{contacts.set.name}"
-    k = contacts.set.k
+def _write_bars(bars: CotangentTables, contacts: ContactList, item: Item, value: Lanes) -> None:
+    name = f"held.{contacts.layout.name}"
+    k = contacts.layout.k
     for j in range(k):
         bars.finger_state.write(name, value[:, j], item.number * k + j)
 
 
-def add_held(bars: CotangentTables, contacts: BoundContacts, item: Item, held: dict) -> None:
+def add_held(bars: CotangentTables, contacts: ContactList, item: Item, held: dict) -> None:
     """Adds an item's cotangents of what its contacts hold, "held", to those of the state."""
-    if contacts.set.holds:
+    if contacts.layout.holds:
         old = held_bars(bars, contacts, item)
         _write_bars(bars, contacts, item, plus(old, held["held"]))
 
 
-def wrench_of_cotangents(problem: Problem, contacts: BoundContacts, item: Item) -> Lanes:
+def wrench_of_cotangents(problem: Problem, contacts: ContactList, item: Item) -> Lanes:
     """Wrench (6,) of what "held_bar" of an item's contacts asks of the step's accelerations.
 
     It is the cotangent of jar, through the force, of what they hold behind the step.
     """
-    build = contacts.set.contacts
     axes = held_axes(problem.memory, contacts)
 
     def of_jar(jar, place, cone, held, bars, axes):
-        return sum_axis(dot(bars, behind(build(place, cone), jar, held, axes)), 0)
+        return sum_axis(dot(bars, behind(make_contacts(place, cone), jar, held, axes)), 0)
 
     def wrench(place, cone, change):
-        return sum_axis(contact.contact_wrench(build(place, cone), change), 1)
+        return sum_axis(contact.contact_wrench(make_contacts(place, cone), change), 1)
 
     def wrenches() -> list[Lanes]:
         place = contacts.place(item)
@@ -298,7 +290,7 @@ def wrench_of_cotangents(problem: Problem, contacts: BoundContacts, item: Item) 
 
 
 def _reverse_fingers(
-    step: StepMemory, bars: CotangentTables, self_contacts: BoundSelfContacts, go: Lanes
+    step: StepMemory, bars: CotangentTables, self_contacts: ContactList, go: Lanes
 ) -> None:
     """Makes the cotangents of the state after the step those of the sums of `holding.hold`.
 
@@ -308,10 +300,10 @@ def _reverse_fingers(
     no_step = zeros((), step.like)
 
     for item in range(pairings(step)):
-        row = item - self_contacts.set.first
+        row = item - self_contacts.layout.first
         mine = state.read(BETWEEN_FINGERS, item)
         sums_bar = zeros((4,), step.like)
-        if 0 <= row < self_contacts.set.rows:
+        if 0 <= row < self_contacts.layout.slots.rows:
             ended = sums(self_contacts, row, no_step, step.finger_state.read(BETWEEN_FINGERS, item))
             theirs = self_contacts.pairing(row).swap(mine)
             both = lanewise(jnp.subtract, mine, theirs) if item else mine
@@ -347,39 +339,35 @@ def add_pairing_cotangents(
     state.scatter(BETWEEN_FINGERS, new, item, lane)
 
 
-def load_cotangents(problem: Problem, self_contacts: BoundSelfContacts) -> None:
+def load_cotangents(problem: Problem, sides: Sides, self_contacts: ContactList) -> None:
     """Loads the links with what "sums_bar" asks of the step's accelerations.
 
     A change of jar changes a contact's force by -K; with r the derivative of the sums by the
     force, the cotangent of jar is -K r.
     """
-    contacts = self_contacts.set.contacts
     lane = problem.block.lane
 
     def of_held(force, place, cone, held, bars):
-        return held_work(contacts(place, cone), force, held, bars)
+        return held_work(make_contacts(place, cone), force, held, bars)
 
-    def load(item: Item) -> None:
+    def force_of(item: Item, side: OwnSide) -> Lanes:
         which = item.pairing.number
         cone = self_contacts.cone_at(item)
-        side = self_contacts.own_side(item)
         jar = self_contacts.read(Contact.jar, item)
 
         def response(place, cone, jar):
-            return contact.constraint_update(contacts(place, cone), jar).force
+            return contact.constraint_update(make_contacts(place, cone), jar).force
 
         force = lanewise(response, side.place, cone, jar)
         held = problem.memory.finger_state.gather(BETWEEN_FINGERS, which, lane)
         bars = problem.memory.scratch.gather(Virtual.sums_bar, which, lane)
         unit = lanes([problem.like + 1.0], (), wide=True)
         (r,) = pull(of_held, (force,), (side.place, cone, held, bars), unit)
-        r = lanewise(jnp.multiply, self_contacts.holds(item), r)
-        change = lanewise(
-            jnp.negative, self_contacts.times_hessian(self_contacts.read(Slot.hessian, item), r)
-        )
-        self_contacts.load(item, side, change)
+        r = lanewise(jnp.multiply, self_contacts.held_part(item), r)
+        hessian = self_contacts.read(Slot.hessian, item)
+        return lanewise(jnp.negative, self_contacts.times_hessian(hessian, r))
 
-    self_contacts.each_item(load)
+    sides.lay_each(self_contacts, force_of)
 
 
 def held_work(

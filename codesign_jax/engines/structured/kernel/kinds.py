@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import objects
-from codesign_jax.engines.structured.kernel.contact_sets import ContactSet, cone_of
+from codesign_jax.engines.structured.kernel.contact_list import cone_of, make_contacts
 from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, dot, sum_axis
 from codesign_jax.engines.structured.laws import contact, holding, rings, shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
@@ -294,7 +294,7 @@ def power(
     kind = KINDS[pair]
     place = kind.evaluate(scene, pair, mine, theirs, numbers, fixed)
     place = place._replace(share=jnp.where(fixed["share"] > 0, place.share, 0.0))
-    contacts = ContactSet.contacts(place, _cone(scene, pair, place, numbers, fixed))
+    contacts = make_contacts(place, _cone(scene, pair, place, numbers, fixed))
     vel, link_acc, along = (
         contacts.relative(m[:, None]) for m in _relative(kind, mine, theirs, numbers, fixed)
     )

@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.coupling import Eliminated, solve_palm_again
-from codesign_jax.engines.structured.kernel.memory import loop, tree_add_scaled
+from codesign_jax.engines.structured.kernel.memory import loop, tree_add_scaled, zeros
 from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
 from codesign_jax.engines.structured.kernel.rows import Again, FingerState, Hand, Scratch
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
 from codesign_jax.engines.structured.lanes import contract, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -33,7 +32,7 @@ LENGTHS = (0.7, 1.4)
 """Lengths of such a step; at others than Newton's, 1, the cost is not quadratic."""
 
 
-def steady(problem: Problem, alpha: Lanes, between: BoundSelfContacts | None) -> jax.Array:
+def steady(problem: Problem, alpha: Lanes, between: ContactList | None) -> jax.Array:
     """Whether no contact of a world goes to another zone along the last step, (lane,).
 
     Args:
@@ -43,12 +42,12 @@ def steady(problem: Problem, alpha: Lanes, between: BoundSelfContacts | None) ->
     block = problem.block
     count = zeros((), problem.like)
 
-    def add(item: Item, sums: Lanes, contacts: BoundContacts) -> Lanes:
+    def add(item: Item, sums: Lanes, contacts: ContactList) -> Lanes:
         return lanewise(jnp.add, sums, contacts.changes(item, alpha))
 
     sets = [*problem.dealt, *problem.per_link, *([between] if between else [])]
     for contacts in sets:
-        count = contacts.fold_items(partial(add, contacts=contacts), count)
+        count = contacts.fold(partial(add, contacts=contacts), count)
     if block.team > 1:
         count = team_sum(block, count)
     return block.sum(count).lane == 0
@@ -77,7 +76,7 @@ class ChordStep:
         self.like = problem.like
 
     def step(
-        self, now: Iterate, done: Eliminated, alpha: Lanes, between: BoundSelfContacts | None
+        self, now: Iterate, done: Eliminated, alpha: Lanes, between: ContactList | None
     ) -> tuple[Iterate, Lanes]:
         """The step of wrist, palm and object; leaves the fingers' part in "z_again".
 
@@ -93,8 +92,8 @@ class ChordStep:
         problem = self.problem
         if chambers := problem.chambers:
             chambers.move(alpha)
-        if between:
-            between.update_wrenches(alpha)
+        if problem.sides and between:
+            problem.sides.update_wrenches(between, alpha)
 
         def again(alpha, carry, body, moved, forces, factors, pushes, self_wrench):
             r, ro, work = carry
@@ -116,8 +115,8 @@ class ChordStep:
                 (Scratch.link_acc, Scratch.step_link_acc),
             ]
             moved = [problem.read(*rows, item=i) for rows in names]
-            pushes = {c.set.name: c.wrench(at(i), alpha) for c in problem.per_link}
-            self_wrench = between.wrench_on(i + 1) if between else None
+            pushes = {c.layout.name: c.wrench(at(i), alpha) for c in problem.per_link}
+            self_wrench = problem.sides.wrench_on(i + 1) if problem.sides else None
             factors = problem.read(
                 Scratch.axes, Hand.armature, Scratch.w, Scratch.g, Again.inverse, item=i
             )
@@ -146,11 +145,11 @@ class ChordStep:
         pushes = {}
         for c in self.problem.dealt:
 
-            def add(item: Item, sums: Lanes, c: BoundContacts = c) -> Lanes:
+            def add(item: Item, sums: Lanes, c: ContactList = c) -> Lanes:
                 return lanewise(jnp.add, sums, c.wrench(item, alpha))
 
-            wrench = c.fold_items(add, zeros((6,), self.like))
-            pushes[c.set.name] = self.block.sum(wrench)
+            wrench = c.fold(add, zeros((6,), self.like))
+            pushes[c.layout.name] = self.block.sum(wrench)
         return pushes
 
     @staticmethod

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.coupling import Eliminated
-from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper
+from codesign_jax.engines.structured.kernel.memory import choose, either, full, loop, upper, zeros
 from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, make_body
 from codesign_jax.engines.structured.kernel.rows import Again, FingerState, Hand, Scratch
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
+from codesign_jax.engines.structured.kernel.sides import Sides
 from codesign_jax.engines.structured.lanes import contract, dot, sum_fingers, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 
@@ -51,9 +51,7 @@ class Elimination:
         self.links = problem.links
         self.like = problem.like
 
-    def backward(
-        self, alpha: Lanes, between: BoundSelfContacts | None
-    ) -> tuple[el.Quadratic, Lanes]:
+    def backward(self, alpha: Lanes, between: ContactList | None) -> tuple[el.Quadratic, Lanes]:
         """Eliminates the fingers from their tips.
 
         Accelerations and jar move by `alpha`, the length of the last step, first: so they
@@ -69,15 +67,15 @@ class Elimination:
         problem = self.problem
         if problem.chambers:
             problem.chambers.move(alpha)
-        if between:
-            self.between_fingers(between, alpha)
+        if problem.sides and between:
+            self.between_fingers(problem.sides, between, alpha)
 
         def step(i: Any, carry: tuple) -> tuple:
             node, work = carry
             acc, link_acc = self.accelerations(i, alpha)
             smooth, tau = self.smooth(i)
             axes, armature = problem.read(Scratch.axes, Hand.armature, item=i)
-            self_wrench = between.wrench_on(i + 1) if between else None
+            self_wrench = problem.sides.wrench_on(i + 1) if problem.sides else None
             node = node._replace(p=full(node.p), q=full(node.q))
             node = lanewise(load_link, node, problem.body_of(i), link_acc, smooth, self_wrench)
             for contacts in problem.per_link:
@@ -123,7 +121,7 @@ class Elimination:
         """Smooth forces on a link and on the joint before it."""
         return self.problem.read(Scratch.smooth, Scratch.tau, item=i)
 
-    def of_contacts(self, contacts: BoundContacts, item: Item, alpha: Lanes) -> tuple[Lanes, Lanes]:
+    def of_contacts(self, contacts: ContactList, item: Item, alpha: Lanes) -> tuple[Lanes, Lanes]:
         """Contact inertia (6, 6, ...) and wrench (6, ...) of an item's contacts at a step's length.
 
         Args:
@@ -133,22 +131,23 @@ class Elimination:
         """
         return contacts.inertia_and_wrench(item, alpha)
 
-    def between_fingers(self, self_contacts: BoundSelfContacts, alpha: Lanes) -> None:
-        self_contacts.update_constraints(alpha)
+    def between_fingers(self, sides: Sides, between: ContactList, alpha: Lanes) -> None:
+        """Lays the forces of the hand's contacts with itself on their sides."""
+        sides.update_constraints(between, alpha)
 
     def add_contacts(
-        self, node: el.Quadratic, contacts: BoundContacts, item: Item, alpha: Lanes
+        self, node: el.Quadratic, contacts: ContactList, item: Item, alpha: Lanes
     ) -> Any:
         def add() -> el.Quadratic:
             return lanewise(
-                _add, node, *self.of_contacts(contacts, item, alpha), contacts.set.on_object
+                _add, node, *self.of_contacts(contacts, item, alpha), contacts.layout.on_object
             )
 
         return choose(contacts.touching(item), add, node, self.block.size)
 
     def last_on_object(self) -> jax.Array | None:
         """Last link with contacts with the object, -1 for none; None if the scene has none."""
-        on_object = [c for c in self.problem.per_link if c.set.on_object]
+        on_object = [c for c in self.problem.per_link if c.layout.on_object]
 
         def later(i: Any, last: jax.Array) -> jax.Array:
             return jnp.where(on_object[0].touching(at(i)), jnp.asarray(i, jnp.int32), last)
@@ -160,15 +159,15 @@ class Elimination:
         pushes = {}
         for c in self.problem.dealt:
 
-            def add(item: Item, carry: tuple, c: BoundContacts = c) -> tuple:
+            def add(item: Item, carry: tuple, c: ContactList = c) -> tuple:
                 matrix, wrench = self.of_contacts(c, item, alpha)
                 return lanewise(
                     lambda a, b: jax.tree.map(jnp.add, a, b), carry, (upper(matrix), wrench)
                 )
 
             start = (zeros((21,), self.like), zeros((6,), self.like))
-            triangle, wrench = self.block.sum(c.fold_items(add, start))
-            pushes[c.set.name] = (full(triangle), wrench)
+            triangle, wrench = self.block.sum(c.fold(add, start))
+            pushes[c.layout.name] = (full(triangle), wrench)
         return pushes
 
     def at_palm(self, now: Iterate, node: el.Quadratic, slots: dict) -> tuple[Iterate, Eliminated]:

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
-from codesign_jax.engines.structured.kernel.memory import anywhere, loop, solid
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
+from codesign_jax.engines.structured.kernel.memory import anywhere, loop, solid, zeros
 from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import (
     Iterate,
@@ -17,7 +17,6 @@ from codesign_jax.engines.structured.kernel.problem import (
     relative,
 )
 from codesign_jax.engines.structured.kernel.rows import FingerState, Hand, Scratch, Side
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.lanes import dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 
@@ -37,7 +36,7 @@ class LineSearch:
         self.like = problem.like
 
     def prepare(
-        self, now: Iterate, step: Iterate, between: BoundSelfContacts | None
+        self, now: Iterate, step: Iterate, between: ContactList | None
     ) -> tuple[Lanes, Lanes, Lanes]:
         """Substitutes back and prepares the line search.
 
@@ -80,11 +79,11 @@ class LineSearch:
             )
             problem.write(Scratch.step_acc, a, i)
             problem.write(Scratch.step_link_acc, moved, i)
-            if between:
-                between.put(Side.link_acc, moved, i + 1)
+            if problem.sides:
+                problem.sides.put(Side.link_acc, moved, i + 1)
             terms = [contact_slope]
             for contacts in problem.per_link:
-                rel = relative(contacts.set.name, moved, step.palm_acc, step.object_acc)
+                rel = relative(contacts.layout.name, moved, step.palm_acc, step.object_acc)
                 terms.append(contacts.prepare_linesearch(at(i), rel))
             contact_slope = lanewise(lambda t: total(t), terms)
             slope, curvature = lanewise(lambda a, b, c, d: (a + b, c + d), slope, s, curvature, c)
@@ -92,14 +91,16 @@ class LineSearch:
 
         none = zeros((), self.like)
         parent = problem.widened(step.palm_acc)
-        if between:
-            between.put(Side.link_acc, parent, 0)
+        if problem.sides:
+            problem.sides.put(Side.link_acc, parent, 0)
         _, slope, curvature, contact_slope = loop(
             self.links, link, (parent, none, none, none), self.block.size
         )
         if problem.chambers:
             curvature = lanewise(jnp.add, curvature, problem.chambers.curvature())
-        slopes = [contact_slope, *([between.prepare_all()] if between else [])]
+        slopes = [contact_slope]
+        if problem.sides and between:
+            slopes.append(problem.sides.prepare_all(between))
         contact_slope = lanewise(lambda t: total(t), slopes)
         contact_slope = self.prepare_slots(contact_slope, step)
         slope, curvature, contact_slope = self.block.sum((slope, curvature, contact_slope))
@@ -110,18 +111,18 @@ class LineSearch:
         """Adds the slopes of the palm's and the object's contacts along the step."""
         for contacts in self.problem.dealt:
 
-            def add(item: Item, sum_: Lanes, contacts: BoundContacts = contacts) -> Lanes:
-                rel = relative(contacts.set.name, None, step.palm_acc, step.object_acc)
+            def add(item: Item, sum_: Lanes, contacts: ContactList = contacts) -> Lanes:
+                rel = relative(contacts.layout.name, None, step.palm_acc, step.object_acc)
                 return lanewise(jnp.add, sum_, contacts.prepare_linesearch(item, rel))
 
-            touch = contacts.fold_items(add, touch)
+            touch = contacts.fold(add, touch)
         return touch
 
     def total(self, sums: list[Lanes]) -> list[Lanes]:
         """Sums of lanes over the fingers of each world."""
         return self.block.sum(sums)
 
-    def contact_slopes(self, alpha: Lanes, between: BoundSelfContacts | None) -> list[Lanes]:
+    def contact_slopes(self, alpha: Lanes, between: ContactList | None) -> list[Lanes]:
         """First and second derivative of the contacts' cost by the step length, at alpha.
 
         Args:
@@ -140,7 +141,7 @@ class LineSearch:
         if sets := problem.per_link:
             sums = loop(self.links, lambda i, s: add(at(i), s, sets), sums, self.block.size)
         for c in problem.dealt:
-            sums = c.fold_items(lambda item, s, c=c: add(item, s, [c]), sums)
+            sums = c.fold(lambda item, s, c=c: add(item, s, [c]), sums)
         if between:
             sums = between.slopes_of_all(alpha, sums)
         return sums
@@ -152,7 +153,7 @@ class LineSearch:
         first: Lanes,
         floor: jax.Array,
         evaluations: int,
-        between: BoundSelfContacts | None,
+        between: ContactList | None,
     ) -> Lanes:
         """Step length, lanes of a world.
 
@@ -164,7 +165,7 @@ class LineSearch:
           between: As in `prepare`.
         """
 
-        def evaluate(alpha: Lanes, among: BoundSelfContacts | None) -> tuple[Lanes, Lanes]:
+        def evaluate(alpha: Lanes, among: ContactList | None) -> tuple[Lanes, Lanes]:
             of_contacts = self.total(self.contact_slopes(alpha, among))
             return lanewise(with_contacts, slope, curvature, alpha, *of_contacts)
 

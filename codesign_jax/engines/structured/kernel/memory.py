@@ -345,6 +345,16 @@ class Block:
         return jax.tree.map(narrow, rebuild(sums), is_leaf=lambda x: isinstance(x, Lanes))
 
 
+def zeros(shape: tuple[int, ...], like: jax.Array) -> Lanes:
+    """Lanes of zeros of a finger each, like an array over the lanes."""
+    return lanes([jnp.zeros_like(like)] * math.prod(shape), shape, wide=True)
+
+
+def any_of(which: jax.Array, then: Callable[[], None]) -> None:
+    """Runs what stores something, if any lane is true."""
+    jax.lax.cond(anywhere(which), then, lambda: None)
+
+
 def anywhere(mask: jax.Array) -> jax.Array:
     """Whether a mask (lane,) holds on any lane, a scalar."""
     return jnp.max(mask.astype(jnp.int32)) > 0

@@ -8,8 +8,9 @@ from functools import partial
 
 from codesign_jax.engines.structured.kernel import objects, rows, shared_memory
 from codesign_jax.engines.structured.kernel import record as recording
-from codesign_jax.engines.structured.kernel.contact_sets import ContactSet
+from codesign_jax.engines.structured.kernel.contact_list import SELF, ContactLayout
 from codesign_jax.engines.structured.kernel.memory import MemoryLayout
+from codesign_jax.engines.structured.kernel.placement import Appended, Fixed
 from codesign_jax.engines.structured.kernel.rows import (
     Again,
     Air,
@@ -21,16 +22,12 @@ from codesign_jax.engines.structured.kernel.rows import (
     Scratch,
     Search,
     Shared,
+    Side,
     World,
     WorldOptions,
     WorldState,
 )
-from codesign_jax.engines.structured.kernel.self_contacts import SelfContactSet, pair_slots
 from codesign_jax.engines.structured.kernel.step_memory import KernelLayout
-from codesign_jax.engines.structured.kernel.team_contacts import (
-    TeamSdfContactSet,
-    TeamSelfContactSet,
-)
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.step_numbers import step_numbers
 from codesign_jax.judge import verdict
@@ -42,6 +39,18 @@ from codesign_jax.scene.section_numbers import Numbers
 
 GATHERING = ("gpu",)
 """Backends whose lanes read rows of their own as fast as a common one."""
+
+
+def pair_slots(scene: Scene) -> int:
+    """Slots of a pair of fingers; a world with more contacts fails (CONTACT_OVERFLOW).
+
+    A ring has one contact with another finger, one with its own and one with the palm.
+    """
+    d = scene.discretization
+    e = scene.effects
+    if e.surface == "hull":
+        return d.links * d.hull_rings * (2 if e.finger_palm and touches_itself(scene) else 1)
+    return min(4 * d.links * d.spheres_per_link, (d.links * d.spheres_per_link) ** 2)
 
 
 class Tables(KernelLayout):
@@ -80,40 +89,45 @@ class Tables(KernelLayout):
         self.meshes = bool(shapes.mesh_indices(scene))
         self.support_points = objects.support_points(scene)
         self.record = record
-        self.self_set = self._self_set()
-        self.sets = self._sets()
-        for contacts in self.sets:
-            contacts.stores_all = bool(record and record.touch and contacts.on_object)
+        self.lists = self._lists()
+        self.self_list = next((c for c in self.lists if c.of_hand), None)
         self.held = held.held(scene)
         self._tables()
 
-    def _self_set(self) -> SelfContactSet | None:
-        e = self.scene.effects
-        between = e.finger_finger and self.num_fingers > 1
-        if not (between or e.finger_palm or touches_itself(self.scene)):
-            return None
-        block = (self.fingers, self.block)
-        slots = pair_slots(self.scene)
-        options = {"gathers": self.gathers, "remembers": self.remembers}
-        if self.team == 1:
-            return SelfContactSet(self.scene, block, self.links, slots, **options)
-        block = (*block, self.team)
-        return TeamSelfContactSet(self.scene, block, self.links, slots, **options)
-
-    def _sets(self) -> list[ContactSet]:
+    def _lists(self) -> list[ContactLayout]:
+        """The contacts of each pair of bodies that the scene has, and where they are."""
         e = self.scene.effects
         k = self.rings_per_link
         n = len(surroundings.fields(self.scene))
-        make = partial(ContactSet, self.scene, size=self.size)
+        touch = bool(self.record and self.record.touch)
+        make = partial(ContactLayout, self.scene, touch=touch)
+        of_fingers = Fixed(self.links)
+        lists = []
         on = {"finger_object": k * e.finger_object, "finger_table": n * k * e.finger_table}
-        fields = make if self.team == 1 else partial(TeamSdfContactSet, self.scene, self)
-        sets = [fields(name, self.links, on[name]) for name in on if on[name]]
-        sets += [self.self_set] if self.self_set else []
+        for name in on:
+            if on[name] and self.team == 1:
+                lists.append(make(name, on[name], of_fingers))
+            elif on[name]:
+                lists.append(make(name, 1, Fixed(self.links * on[name], shared=True)))
+        lists += self._of_hand()
+        of_palm = Fixed(self.palm_groups)
         on = {"palm_object": int(e.palm_object), "palm_table": n * e.palm_table}
-        sets += [make(name, self.palm_groups, on[name]) for name in on if on[name]]
+        lists += [make(name, on[name], of_palm) for name in on if on[name]]
         groups = -(-surroundings.slots(self.scene) // self.fingers)
-        on_table = [make("object_table", groups, 1)] if e.object_table and groups else []
-        return [*sets, *on_table]
+        on_table = [make("object_table", 1, Fixed(groups))] if e.object_table and groups else []
+        return [*lists, *on_table]
+
+    def _of_hand(self) -> list[ContactLayout]:
+        """The list of the hand's contacts with itself; empty without."""
+        e = self.scene.effects
+        between = e.finger_finger and self.num_fingers > 1
+        alone = e.finger_palm or touches_itself(self.scene)
+        if not (between or alone):
+            return []
+        # A row for each pairing of fingers, and one for contacts of a finger with itself and palm.
+        rows = self.fingers - int(not alone) if e.finger_finger else 1
+        slots = Appended(rows, pair_slots(self.scene), self.gathers, shared=self.team > 1)
+        return [ContactLayout(self.scene, SELF, 1, slots, remembers=self.remembers)]
 
     @property
     def gathers(self) -> bool:
@@ -171,7 +185,7 @@ class Tables(KernelLayout):
         """Constants of worlds: of palm, wrist, object, verdict and contacts."""
         groups = self._groups(World)
         groups |= dict.fromkeys(verdict.Bounds._fields, (1, ()))
-        for contacts in self.sets:
+        for contacts in self.lists:
             groups |= contacts.cone_rows()
         groups |= {name: (1, number.shape) for name, number in step_numbers(self.scene).items()}
         return groups | self._groups(WorldOptions)
@@ -179,8 +193,10 @@ class Tables(KernelLayout):
     def _scratch_groups(self) -> dict[str, Group]:
         """What a step leaves for its parts: bodies, forces, factors, contacts."""
         groups = self._groups(Scratch)
-        for contacts in self.sets:
+        for contacts in self.lists:
             groups |= contacts.groups()
+            if contacts.of_hand:
+                groups |= self._groups(Side)
         if self.scene.effects.air_mass:
             groups |= self._groups(Air)
         if self.has_slots or self.scene.effects.air_mass:

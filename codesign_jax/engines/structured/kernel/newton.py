@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, record
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.last_step import (
     LARGEST,
@@ -23,6 +24,7 @@ from codesign_jax.engines.structured.kernel.last_step import (
 from codesign_jax.engines.structured.kernel.linear_system import Elimination
 from codesign_jax.engines.structured.kernel.linesearch import FAR, LINE_TOLERANCE, LineSearch
 from codesign_jax.engines.structured.kernel.memory import (
+    any_of,
     anywhere,
     choose,
     loop,
@@ -31,8 +33,6 @@ from codesign_jax.engines.structured.kernel.memory import (
 )
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem
 from codesign_jax.engines.structured.kernel.rows import FingerState
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
-from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.team_solver import (
     TeamCoupling,
     TeamElimination,
@@ -70,8 +70,8 @@ class Newton:
         self.coupling = Coupling if single_lanes else TeamCoupling
         # A chord's step would take a GPU as long as it saves: there an iteration ends without one.
         pairs = problem.self_contacts
-        self.accepts_steady = pairs is not None and pairs.set.gathers
-        chords = pairs is not None and not pairs.set.gathers
+        self.accepts_steady = pairs is not None and pairs.layout.slots.gathers
+        chords = pairs is not None and not pairs.layout.slots.gathers
         self.chord = ChordStep(problem) if chords and single_lanes else None
 
     def solve(
@@ -219,7 +219,7 @@ class Newton:
         return choose(anywhere(ending), lambda: look(ending), as_was, size)
 
     def direction(
-        self, now: Iterate, last: Lanes, idle: jax.Array, between: BoundSelfContacts | None
+        self, now: Iterate, last: Lanes, idle: jax.Array, between: ContactList | None
     ) -> tuple[Iterate, Eliminated]:
         """Newton's step: the fingers' factors, and the step of wrist and object.
 

@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel.chambers import Chambers
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import tree_add_scaled
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
+from codesign_jax.engines.structured.kernel.memory import tree_add_scaled, zeros
 from codesign_jax.engines.structured.kernel.rows import Air, Hand, Scratch
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
@@ -50,6 +49,7 @@ class Problem:
       links: Moving links of a finger; `block`: the lanes; `like`: zeros of their shape and type.
       rigid: Whether the wrist's accelerations are known and no unknowns.
       self_contacts: Contacts of the hand with itself; None without.
+      sides: Their sides; None without.
       per_link: Contacts of the fingers with what is no finger, whose items are links.
       dealt: Contacts of the palm, and of the object with the table, whose items are dealt to the
         fingers' lanes.
@@ -63,12 +63,13 @@ class Problem:
         self.block = memory.block
         self.rigid = not memory.layout.scene.effects.wrist
         self.self_contacts = memory.self_contacts
-        self.per_link = [c for c in memory.field_contacts if c.set.per_link]
-        self.dealt = [c for c in memory.field_contacts if not c.set.per_link]
+        self.sides = memory.sides
+        self.per_link = [c for c in memory.field_contacts if c.layout.per_link]
+        self.dealt = [c for c in memory.field_contacts if not c.layout.per_link]
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
         self.chambers = Chambers(memory) if Air.air_step in memory.scratch else None
 
-    def between(self, busy: jax.Array) -> BoundSelfContacts | None:
+    def between(self, busy: jax.Array) -> ContactList | None:
         """Contacts of the hand with itself in worlds of the lanes `busy`; None without any."""
         return None if self.self_contacts is None else self.self_contacts.masked(busy)
 
@@ -94,8 +95,8 @@ class Problem:
 
     def add_palm_wrench(self, r: Lanes) -> Lanes:
         """Adds the self-contacts that act on the palm."""
-        assert self.self_contacts is not None
-        return lanewise(jnp.add, r, self.self_contacts.wrench_on(0))
+        assert self.sides is not None
+        return lanewise(jnp.add, r, self.sides.wrench_on(0))
 
     def widened(self, acc: Lanes) -> Lanes:
         """Lanes of a world as those of its fingers."""

@@ -13,13 +13,14 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory
-from codesign_jax.engines.structured.kernel.contact_sets import (
-    BoundContacts,
-    ContactSet,
+from codesign_jax.engines.structured.kernel.contact_list import (
+    SELF,
+    ContactLayout,
+    ContactList,
     force_of_jar,
-    zeros,
+    make_contacts,
 )
-from codesign_jax.engines.structured.kernel.memory import BoundTable, choose
+from codesign_jax.engines.structured.kernel.memory import BoundTable, choose, zeros
 from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, relative
 from codesign_jax.engines.structured.kernel.rows import (
@@ -32,30 +33,26 @@ from codesign_jax.engines.structured.kernel.rows import (
     TouchForce,
     WorldState,
 )
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import holding
 
-SELF = "finger_finger"
-"""The set of the hand's contacts with itself."""
-
 
 def groups(layout: Any) -> dict[str, Group]:
     """Rows that a kernel's layout records, by the name of a contact set and of a field."""
     recorded: dict[str, Group] = {}
-    for contacts in layout.sets:
+    for contacts in layout.lists:
         for table in tables(layout, contacts):
             for field, group in table.groups(layout.record, contacts.sizes).items():
                 recorded[f"{contacts.name}.{field}"] = group
     return recorded
 
 
-def tables(layout: Any, contacts: ContactSet) -> tuple:
+def tables(layout: Any, contacts: ContactLayout) -> tuple:
     """The declarations of what is recorded of a set."""
-    if contacts is layout.self_set:
+    if contacts.of_hand:
         return (PairForce,)
     return (ForceSum, TouchForce) if contacts.stores_all else (ForceSum,)
 
@@ -73,18 +70,18 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
     mask = lanes([ends], (), wide=True)
     step = problem.memory
 
-    def moved(contacts: BoundContacts, item: Item) -> Lanes:
+    def moved(contacts: ContactList, item: Item) -> Lanes:
         jar = contacts.read(Contact.jar, item)
         return lanewise(_moved, mask, jar, alpha, contacts.read(Contact.step, item))
 
-    def put(contacts: BoundContacts, item: Item, jar: Lanes) -> None:
+    def put(contacts: ContactList, item: Item, jar: Lanes) -> None:
         old = contacts.read(Contact.step, item)
         contacts.write(Contact.jar, jar, item)
         contacts.write(Contact.step, lanewise(_zero_where, mask, old), item)
 
     for contacts in (*problem.per_link, *problem.dealt):
 
-        def settle_item(item: Item, contacts: BoundContacts = contacts) -> None:
+        def settle_item(item: Item, contacts: ContactList = contacts) -> None:
             def store() -> None:
                 jar = moved(contacts, item)
                 if Scratch.chord_link_acc in step.scratch:
@@ -94,25 +91,25 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
 
             jax.lax.cond(contacts.touching(item), store, lambda: None)
 
-        contacts.each_item(settle_item)
+        contacts.each(settle_item)
     if problem.self_contacts is not None:
         self_contacts = problem.self_contacts
 
         def settle_slot(item: Item) -> None:
             put(self_contacts, item, moved(self_contacts, item))
 
-        self_contacts.masked(ends).each_item(settle_slot)
+        self_contacts.masked(ends).each(settle_slot)
     if Scratch.chord_link_acc in step.scratch:
         _each(problem.links, lambda i: step.scratch.write(
             Scratch.chord_link_acc, zeros((6,), step.like), i
         ))  # fmt: skip
 
 
-def _chord_of(problem: Problem, contacts: BoundContacts, item: Item, chord: Iterate) -> Lanes:
+def _chord_of(problem: Problem, contacts: ContactList, item: Item, chord: Iterate) -> Lanes:
     """Change of a set's relative acceleration by the chord step, shape (6,)."""
-    name = contacts.set.name
+    name = contacts.layout.name
     link = None
-    if contacts.set.per_link:
+    if contacts.layout.per_link:
         link = problem.memory.scratch.read(Scratch.chord_link_acc, item.number)
     return relative(name, link, chord.palm_acc, chord.object_acc)
 
@@ -120,12 +117,12 @@ def _chord_of(problem: Problem, contacts: BoundContacts, item: Item, chord: Iter
 def write(step: StepMemory, table: BoundTable) -> None:
     """Writes the forces of the step's contacts, at its accelerations; before it is integrated."""
     for contacts in step.field_contacts:
-        _write_set(step, contacts.set.name, contacts, table)
+        _write_set(step, contacts.layout.name, contacts, table)
     if (pairs := step.self_contacts) is not None:
-        _each(pairs.set.rows, lambda row: _write_pairing(step, pairs, row, table))
+        _each(pairs.layout.slots.rows, lambda row: _write_pairing(step, pairs, row, table))
 
 
-def _write_set(step: StepMemory, name: str, contacts: BoundContacts, table: BoundTable) -> None:
+def _write_set(step: StepMemory, name: str, contacts: ContactList, table: BoundTable) -> None:
     """Writes what a set's contacts do, and with `stores_all` each of them."""
     energy = f"{name}.{ForceSum.energy}" in table
     none = [zeros((3,), step.like), *[zeros((), step.like)] * (2 + energy)]
@@ -136,20 +133,20 @@ def _write_set(step: StepMemory, name: str, contacts: BoundContacts, table: Boun
             held = friction_memory.held_by_item(step, contacts, item) if energy else None
             return lanewise(_add_item, sums, *numbers, None if held is None else held[0])
 
-        return choose(contacts.touching(item), added, sums, contacts.set.size)
+        return choose(contacts.touching(item), added, sums, contacts.size)
 
-    force, pressing, depth, *stored = contacts.fold_items(add, none)
-    if contacts.set.in_teams:
+    force, pressing, depth, *stored = contacts.fold(add, none)
+    if contacts.layout.placement.shared:
         force, pressing = (team_sum(step.block, v) for v in (force, pressing))
         depth = _most_of_team(step, depth)
     fields = [ForceSum.force, ForceSum.pressing, ForceSum.depth, ForceSum.energy]
     for field, value in zip(fields, (force, pressing, depth, *stored), strict=False):
         table.write(f"{name}.{field}", value)
-    if contacts.set.stores_all:
+    if contacts.layout.stores_all:
         _write_rings(step, name, contacts, table)
 
 
-def _write_rings(step: StepMemory, name: str, contacts: BoundContacts, table: BoundTable) -> None:
+def _write_rings(step: StepMemory, name: str, contacts: ContactList, table: BoundTable) -> None:
     """Writes place and force of each of a set's rings, those that do not touch as well."""
     position = step.world_state.read(WorldState.position)
 
@@ -162,12 +159,10 @@ def _write_rings(step: StepMemory, name: str, contacts: BoundContacts, table: Bo
         for field, value in zip(TouchForce.fields(), values, strict=True):
             contacts.record(table, f"{name}.{field}", value, item)
 
-    contacts.each_item(put)
+    contacts.each(put)
 
 
-def _write_pairing(
-    step: StepMemory, contacts: BoundSelfContacts, row: Any, table: BoundTable
-) -> None:
+def _write_pairing(step: StepMemory, contacts: ContactList, row: Any, table: BoundTable) -> None:
     """Writes what the fingers of a pairing do to one another, to themselves and to the palm."""
     energy = f"{SELF}.{PairForce.energy}" in table
     hold = friction_memory.held_by_pairing(step, contacts, row) if energy else []
@@ -180,12 +175,12 @@ def _write_pairing(
             palm = jnp.where(itself & (other < 0.5), 1.0, palm)
         side = lanes([palm], (), wide=True)
         numbers = contacts.place(item), contacts.cone_at(item), contacts.read(Contact.jar, item)
-        held = [lanewise(jnp.multiply, h, contacts.holds(item)) for h in hold]
+        held = [lanewise(jnp.multiply, h, contacts.held_part(item)) for h in hold]
         return lanewise(_add_slot, sums, side, *numbers, *held)
 
     none = [zeros((2,), step.like)] * (2 + energy)
-    pressing, depth, *stored = contacts.fold(row, add, none)
-    if contacts.set.in_teams:
+    pressing, depth, *stored = contacts.fold_row(row, add, none)
+    if contacts.layout.placement.shared:
         pressing = team_sum(step.block, pressing)
         depth = _most_of_team(step, depth)
     fields = [PairForce.pressing, PairForce.depth, PairForce.energy]
@@ -224,7 +219,7 @@ def _add_item(sums, place, cone, jar, held_friction):
     total, pressing, depth, *stored = sums
     force = force_of_jar(place, cone, jar)
     if stored:
-        contacts = ContactSet.contacts(place, cone)
+        contacts = make_contacts(place, cone)
         stored = [stored[0] + sum_axis(holding.stored_energy(contacts, held_friction), 0)]
     pressing = pressing + sum_axis(dot(place.normal, force), 0)
     return [total + sum_axis(force, 1), pressing, _deeper(depth, place), *stored]
@@ -244,7 +239,7 @@ def _add_slot(sums, palm, place, cone, jar, held_friction=None):
     deep = _deeper(jnp.zeros_like(palm), place)
     if stored:
         held_friction = None if held_friction is None else held_friction[:, None]
-        contacts = ContactSet.contacts(place, cone)
+        contacts = make_contacts(place, cone)
         energy = sum_axis(holding.stored_energy(contacts, held_friction), 0)
         stored = [stored[0] + side * energy]
     return [pressing + side * force, jnp.maximum(depth, side * deep), *stored]

@@ -9,10 +9,9 @@ from typing import Any
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import residual
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, plus, pull
 from codesign_jax.engines.structured.kernel.kinds import BodyMotion
-from codesign_jax.engines.structured.kernel.memory import choose, loop
+from codesign_jax.engines.structured.kernel.memory import choose, loop, zeros
 from codesign_jax.engines.structured.kernel.residual import Before, FastMotion, LinkMotion
 from codesign_jax.engines.structured.kernel.rows import (
     BodyBar,

@@ -11,12 +11,10 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import anywhere, choose, loop
+from codesign_jax.engines.structured.kernel.memory import any_of, anywhere, choose, loop, zeros
+from codesign_jax.engines.structured.kernel.pairing import FingerPairing
 from codesign_jax.engines.structured.kernel.rows import Search
-from codesign_jax.engines.structured.kernel.self_contacts import FingerPairing
 from codesign_jax.engines.structured.kernel.shared_memory import where
-from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 

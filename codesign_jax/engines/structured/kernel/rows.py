@@ -288,14 +288,14 @@ class Slot(Rows):
     force = field(ITEM, 3, CONTACTS)
     # Second side of contacts that a finger has with itself or the palm
     other = field(ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself)
-    # The different rows of a slot's lanes, see `BoundSelfContacts._list_rows`
-    row_listed = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.gathers)
-    row_count = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.gathers)
+    # The different rows of a slot's lanes, see `Sides.list_rows`
+    row_listed = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.slots.gathers)
+    row_count = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.slots.gathers)
     other_listed = field(
-        ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself and not contacts.gathers
+        ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself and not contacts.slots.gathers
     )
     other_count = field(
-        ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself and not contacts.gathers
+        ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself and not contacts.slots.gathers
     )
 
 
@@ -363,10 +363,10 @@ class Side(Rows, prefix="side"):
     """Bodies of the fingers' contacts with one another, from the palm to the tips."""
 
     link_acc = field(BODY, 6)
-    link_acc_spare = field(BODY, SPARE, on=lambda contacts: contacts.in_teams)
+    link_acc_spare = field(BODY, SPARE, on=lambda layout: layout.team > 1)
     vel = field(BODY, 6)
     wrench = field(BODY, 6)
-    wrench_spare = field(BODY, SPARE, on=lambda contacts: contacts.in_teams)
+    wrench_spare = field(BODY, SPARE, on=lambda layout: layout.team > 1)
 
 
 class Chip(Rows):

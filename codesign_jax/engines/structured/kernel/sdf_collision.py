@@ -11,8 +11,9 @@ from typing import Any
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, objects
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, zeros
+from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.kinds import beside
+from codesign_jax.engines.structured.kernel.memory import any_of, zeros
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.placement import Item, at
 from codesign_jax.engines.structured.kernel.problem import relative
@@ -24,7 +25,6 @@ from codesign_jax.engines.structured.kernel.rows import (
     WorldState,
 )
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision, closed
-from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -52,7 +52,7 @@ class SdfCollision:
         self.bodies = bodies
         self.world_object = world_object
         self.contacts = step.contacts
-        self.names = [c.set.name for c in step.field_contacts if c.set.per_link]
+        self.names = [c.layout.name for c in step.field_contacts if c.layout.per_link]
         self.surface = step.layout.scene.effects.surface
 
     def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:
@@ -105,9 +105,9 @@ class SdfCollision:
         """Contacts of the fingers' rings, dealt to the lanes of a team."""
         for name in self.names:
             contacts = self.contacts[name]
-            contacts.begin_step()  # type: ignore[attr-defined]
+            contacts.write_empty()
 
-            def ring(item: Item, name: str = name, contacts: BoundContacts = contacts) -> None:
+            def ring(item: Item, name: str = name, contacts: ContactList = contacts) -> None:
                 row, numbers, frame, centre = search.body(item.number)
                 numbers, centre = (lanewise(as_item, v) for v in (numbers, centre))
                 moves = self.moves(
@@ -116,7 +116,7 @@ class SdfCollision:
                 hold = friction_memory.held_by_item(self.step, contacts, item)
                 self.on_field(name, item, numbers, frame, centre, moves, hold)
 
-            contacts.each_item(ring)
+            contacts.each(ring)
 
     def numbers(self, i: Any) -> Lanes:
         k = self.layout.rings_per_link
@@ -137,7 +137,7 @@ class SdfCollision:
         contacts = self.contacts[name]
         looks = self.looks(name)
         seen = [look(centre) for look in looks]
-        friction = self.frictions(name, contacts.set.k // len(looks))
+        friction = self.frictions(name, contacts.layout.k // len(looks))
         if self.surface == "spheres":
             places = [lanewise(ball_on_field, numbers, centre, *first) for first in seen]
             return contacts.create(item, joined(places), *moves, friction=friction)
@@ -146,7 +146,7 @@ class SdfCollision:
         )  # the table comes first
         most = self.closing_gap(numbers, centre, moves[1])
         near = [lanewise(may_touch, numbers, first[0], most).lane for first in seen]
-        contacts.write(Contact.share, zeros((contacts.set.k,), self.step.like), item)
+        contacts.write(Contact.share, zeros((contacts.layout.k,), self.step.like), item)
 
         def look_again() -> None:
             faced = []
@@ -188,7 +188,7 @@ class SdfCollision:
         on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
         rubs = self.frictions("object_table")
-        for i in range(on_table.set.count if on_table else 0):
+        for i in range(on_table.layout.placement.items if on_table else 0):
             assert on_table is not None
             mine = range(i * layout.fingers, min((i + 1) * layout.fingers, len(slots)))
             place = Place(*self._deal([slots[k] for k in mine]))

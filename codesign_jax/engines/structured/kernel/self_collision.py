@@ -14,13 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory
-from codesign_jax.engines.structured.kernel.contact_sets import (
-    as_candidates,
-    fields_of,
-    margin,
-    with_held,
-    zeros,
-)
+from codesign_jax.engines.structured.kernel.contact_list import ContactList, fields_of, with_held
 from codesign_jax.engines.structured.kernel.kinds import (
     above,
     balls,
@@ -29,7 +23,8 @@ from codesign_jax.engines.structured.kernel.kinds import (
     place_of,
     with_axis,
 )
-from codesign_jax.engines.structured.kernel.memory import BoundTable, loop, solid
+from codesign_jax.engines.structured.kernel.memory import BoundTable, any_of, loop, solid, zeros
+from codesign_jax.engines.structured.kernel.pairing import FingerPairing
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
 from codesign_jax.engines.structured.kernel.rows import (
     Contact,
@@ -41,11 +36,6 @@ from codesign_jax.engines.structured.kernel.rows import (
     Slot,
     WorldOptions,
 )
-from codesign_jax.engines.structured.kernel.self_contacts import (
-    BoundSelfContacts,
-    FingerPairing,
-)
-from codesign_jax.engines.structured.kernel.slots import any_of
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -76,9 +66,11 @@ the speed with which it moves as the link turns [ours]."""
 class SelfCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
-    def __init__(self, step: StepMemory, self_contacts: BoundSelfContacts, bodies: dict[str, Any]):
+    def __init__(self, step: StepMemory, self_contacts: ContactList, bodies: dict[str, Any]):
         self.step = step
+        assert step.sides is not None
         self.contacts = self_contacts
+        self.sides = step.sides
         self.layout = step.layout
         self.scratch = step.scratch
         self.block = step.block
@@ -132,7 +124,7 @@ class SelfCollision:
 
     def start(self, link_acc: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
         """Empties the slots; stores what belongs to the palm."""
-        for row in range(self.contacts.set.rows):
+        for row in range(self.contacts.layout.slots.rows):
             self.contacts.clear(row)
         friction_memory.clear(self.step)
         self.write(Search.fastest, zeros((), self.like))
@@ -148,8 +140,8 @@ class SelfCollision:
         self.write(Search.fastest, lanewise(_faster, *size))
 
     def _side(self, row: Any, link_acc: Lanes, vel: Lanes, frame: Lanes, joint: Lanes) -> None:
-        self.contacts.put(Side.link_acc, link_acc, row)
-        self.contacts.put(Side.vel, vel, row)
+        self.sides.put(Side.link_acc, link_acc, row)
+        self.sides.put(Side.vel, vel, row)
         self.write(Search.frame, frame, row)
         self.write(Search.joint, joint, row)
 
@@ -160,8 +152,8 @@ class SelfCollision:
     def side_of(self, name: Field, row: Any, lane: jax.Array | None = None) -> Lanes:
         """A field of `rows.Side` of bodies, of the lanes' own fingers or those of other lanes."""
         if lane is None and not jnp.ndim(row):
-            return self.contacts.table.read(name, row)
-        return self._gathered(self.contacts.table, name, row, lane)
+            return self.sides.table.read(name, row)
+        return self._gathered(self.sides.table, name, row, lane)
 
     def _lines(self) -> None:
         """Ends the centre lines at the tips' rings; stores their segments."""
@@ -205,7 +197,7 @@ class SelfCollision:
             pairing = self.contacts.pairing(row)
             other = jax.lax.div(pairing.lane, jnp.int32(self.layout.block))
             owner = (self.block.finger < other) & (other < self.layout.num_fingers)
-            if self.hull and not self.contacts.set.gathers:
+            if self.hull and not self.contacts.layout.slots.gathers:
                 RingPairs(self, row, pairing, owner).find()
                 return x
             if self.hull:
@@ -218,7 +210,10 @@ class SelfCollision:
             return x
 
         jax.lax.fori_loop(
-            int(self.contacts.set.with_itself), self.contacts.set.rows, pairing, jnp.int32(0)
+            int(self.contacts.layout.with_itself),
+            self.contacts.layout.slots.rows,
+            pairing,
+            jnp.int32(0),
         )
 
     def _each_ring(self, link: int, search: Callable) -> None:
@@ -234,14 +229,14 @@ class SelfCollision:
 
     # As a grasp begins
 
-    def deepest(self) -> Lanes:
+    def deepest(self, contacts: ContactList) -> Lanes:
         """The largest overlap of fingers with one another and with the palm [m], or zero.
 
-        See `engines.depths.depth_between` and `depth_in_palm`.
+        Contacts are those that were found. See `engines.depths.depth_between` and `depth_in_palm`.
         """
         depth = zeros((), self.like)
         if self.palm is not None:
-            depth = self.contacts.deepest_in_palm(depth)
+            depth = contacts.deepest_in_palm(depth)
         if not self.layout.scene.effects.finger_finger:
             return depth
 
@@ -315,7 +310,7 @@ class SelfCollision:
         theirs: list[Lanes],
         held: list[Lanes],
     ) -> dict[str, Lanes]:
-        """Fields of a contact of a link with another body, see `BoundContacts.begin`.
+        """Fields of a contact of a link with another body, see `ContactList.create`.
 
         Args:
           row: The link.
@@ -323,9 +318,8 @@ class SelfCollision:
           held: What the contact holds of friction, (3,), or nothing.
         """
         place = lanewise(with_axis, place)
-        run = partial(as_candidates, margin(self.layout.scene))
-        moves = lanewise(_differences, mine, theirs)
-        place, jar = lanewise(run, place, cone, *moves)
+        acc, vel = lanewise(_differences, mine, theirs)
+        place, jar = self.contacts.begin(place, cone, acc, vel)
         for g in held:
             jar = lanewise(_with_held, jar, place, cone, g)
         return fields_of(place, jar) | {Slot.row: self._number(row)}
@@ -346,7 +340,7 @@ class SelfCollision:
           row: int32, shape (lane,).
           pairing: Whose partner has the rows; None for the lanes' own fingers.
         """
-        if self.contacts.set.gathers:
+        if self.contacts.layout.slots.gathers:
             return read(row, None if pairing is None else pairing.lane)
         # The lanes that have the rows read them, and then pass them on.
         left = jnp.where(which, row, -1)
@@ -381,7 +375,7 @@ class SelfCollision:
         candidate |= {Slot.other: self._number(other)}
         candidate |= self.contacts.remembered({Remembered.owner: 1.0, Remembered.ring: item})
         which = mine & (candidate[Contact.share].lane > 0)
-        any_of(which, lambda: self.contacts.add(0, which, candidate, self.block.column))
+        any_of(which, lambda: self.contacts.append(0, which, candidate))
 
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
         row, numbers, frame, centre = self.body(item)
@@ -522,7 +516,7 @@ class SelfCollision:
         theirs |= {
             name: lanewise(jnp.negative, mine[name]) for name in (Contact.normal, Contact.jar)
         }
-        none = {Slot.other: zeros((1, 1), self.like)} if self.contacts.set.with_itself else {}
+        none = {Slot.other: zeros((1, 1), self.like)} if self.contacts.layout.with_itself else {}
 
         alike = (
             self.contacts.remembered({Remembered.owner: owner, Remembered.ring: item})
@@ -563,7 +557,7 @@ class SelfCollision:
         best = lanes([self.like + 1.0, self.like, self.like], (3,), wide=True)
         first = int(itself is not None)  # a finger's half link at the palm is the palm's
         count: Any = last + 1 - first
-        if itself is not None and not self.contacts.set.gathers:
+        if itself is not None and not self.contacts.layout.slots.gathers:
             count = jnp.clip(self._rows_back(itself), 0, count)
         best = loop(count, lambda k, b: nearer(k + first, b), best, self.block.size)
         square, number, t = (best[k].lane for k in range(3))

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects, record
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
-from codesign_jax.engines.structured.kernel.memory import BoundTable, anywhere, loop
+from codesign_jax.engines.structured.kernel.memory import BoundTable, anywhere, loop, zeros
 from codesign_jax.engines.structured.kernel.newton import Convergence, Limits, Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Problem, triangle
@@ -128,7 +127,7 @@ class Step(StepMemory):
         """
         depths = [c.deepest().lane for c in self.field_contacts]
         if self.search:
-            depths.append(self.search.deepest().lane)
+            depths.append(self.search.deepest(self.self_contacts).lane)
         deepest = self.like
         for depth in depths:
             deepest = jnp.maximum(deepest, depth)
@@ -237,8 +236,7 @@ class Step(StepMemory):
             search.find()
         if search and layout.team > 1:
             fields.of_rings(search)
-        if self_contacts is not None:
-            self_contacts.keep_counts()
+        self.end_search()
         fields.of_palm_and_object(state)
         count = layout.num_fingers * layout.links
         middle = self.block.sum(middle)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_sets import BoundContacts, ContactSet
+from codesign_jax.engines.structured.kernel.contact_list import ContactLayout, ContactList
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
 from codesign_jax.engines.structured.kernel.rows import (
     FingerState,
@@ -15,7 +15,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     World,
     WorldOptions,
 )
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts, SelfContactSet
+from codesign_jax.engines.structured.kernel.sides import Sides
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.rings import grown, growth_factors
@@ -69,8 +69,8 @@ class KernelLayout:
     hull: bool  # Whether fingers have rings
     meshes: bool  # Whether there are objects with meshes
     support_points: int  # Support points of a mesh
-    sets: list[ContactSet]  # The contacts of each pair of bodies
-    self_set: SelfContactSet | None  # Those of the hand with itself, one of `sets`
+    lists: list[ContactLayout]  # The contacts of each pair of bodies
+    self_list: ContactLayout | None  # Those of the hand with itself, one of `lists`
     record: Record | None  # What a rollout records of its contacts
     held: dict[str, int]  # What contacts hold of friction, see `model.held`
     # Rows of the tables; `onchip` with teams only.
@@ -86,7 +86,7 @@ class KernelLayout:
     @property
     def has_slots(self) -> bool:
         """Whether there are contacts in slots: those of the hand with itself."""
-        return self.self_set is not None
+        return self.self_list is not None
 
     @property
     def tapered(self) -> bool:
@@ -133,9 +133,10 @@ class StepMemory:
       block: The lanes.
       grid: Distances of all meshes, a reference; None without meshes.
       like: Zeros of the lanes' shape and type.
-      contacts: The contact sets with their memory, by name.
+      contacts: The contact lists, by pair of bodies.
       self_contacts: That of the hand with itself; None without.
-      field_contacts: The others, whose contacts have a fixed place.
+      sides: The bodies that these are between; None without.
+      field_contacts: The other lists, whose contacts have a fixed place.
       columns: Columns of the object's orientation, once they are known.
     """
 
@@ -152,23 +153,30 @@ class StepMemory:
         onchip = references.onchip
         self.onchip = None if onchip is None else BoundTable(layout.onchip, onchip)
         self.like = jnp.zeros((layout.size,), references.finger_state.dtype)
-        self.contacts: dict[str, BoundContacts] = {}
-        self.self_contacts: BoundSelfContacts | None = None
-        self.field_contacts: list[BoundContacts] = []
+        self.contacts: dict[str, ContactList] = {}
+        self.self_contacts: ContactList | None = None
+        self.sides: Sides | None = None
+        self.field_contacts: list[ContactList] = []
         self.columns: Lanes | None = None
 
     def bind_contacts(self) -> None:
-        """Begins a step's contacts: the sets with their memory, which is empty."""
-        self_set = self.layout.self_set
-        self.field_contacts = []
-        for contacts in self.layout.sets:
-            if self_set is not None and contacts is self_set:
-                self.self_contacts = self_set.bind(self.scratch, self.constant)
-                self.contacts[contacts.name] = self.self_contacts
-            else:
-                bound = contacts.bind(self.scratch, self.constant)
-                self.field_contacts.append(bound)
-                self.contacts[contacts.name] = bound
+        """Begins a step's contacts: the lists in memory, which is empty."""
+        layout = self.layout
+        bound = {c.name: c.bind(self.scratch, self.block, self.constant) for c in layout.lists}
+        self.contacts = bound
+        self.field_contacts = [c for c in bound.values() if not c.layout.of_hand]
+        if layout.self_list is not None:
+            self.self_contacts = bound[layout.self_list.name]
+            gathers = layout.self_list.slots.gathers
+            self.sides = Sides(self.scratch, self.block, layout.links + 1, gathers=gathers)
+
+    def end_search(self) -> None:
+        """Counts the contacts of the hand with itself, when all are found."""
+        if self.self_contacts is None or self.sides is None:
+            return
+        self.self_contacts = self.self_contacts.counted()
+        self.contacts[self.self_contacts.layout.name] = self.self_contacts
+        self.sides.list_rows(self.self_contacts)
 
     def _table(self, name: str) -> BoundTable:
         tables = self.hand, self.finger_state, self.scratch, self.onchip

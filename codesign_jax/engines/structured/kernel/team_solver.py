@@ -6,12 +6,17 @@ import jax
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import elimination as el
-from codesign_jax.engines.structured.kernel.contact_sets import zeros
+from codesign_jax.engines.structured.kernel.contact_list import (
+    ContactList,
+    make_contacts,
+    symmetric_times,
+)
 from codesign_jax.engines.structured.kernel.coupling import Coupling, Eliminated
 from codesign_jax.engines.structured.kernel.linear_system import Elimination, with_palm
 from codesign_jax.engines.structured.kernel.linesearch import LineSearch, with_palm_and_object
-from codesign_jax.engines.structured.kernel.memory import loop
-from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body
+from codesign_jax.engines.structured.kernel.memory import choose, loop, zeros
+from codesign_jax.engines.structured.kernel.placement import Item, at
+from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, make_body, relative
 from codesign_jax.engines.structured.kernel.rows import (
     Again,
     Chip,
@@ -20,8 +25,8 @@ from codesign_jax.engines.structured.kernel.rows import (
     Scratch,
     Shared,
     Side,
+    TeamRing,
 )
-from codesign_jax.engines.structured.kernel.self_contacts import BoundSelfContacts
 from codesign_jax.engines.structured.kernel.shared_memory import (
     AGAIN,
     FORCES,
@@ -31,8 +36,10 @@ from codesign_jax.engines.structured.kernel.shared_memory import (
     chosen,
     team_sum,
 )
+from codesign_jax.engines.structured.kernel.sides import Sides
 from codesign_jax.engines.structured.lanes import contract, dot, inverse_spd, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
+from codesign_jax.engines.structured.laws import contact
 
 
 class TeamLanes:
@@ -192,14 +199,15 @@ class TeamElimination(Elimination):
         unit = [jnp.where(self.block.mate == k, ones, 0.0) for k in range(6)]
         self.unit = lanes(unit, (6,), wide=True)
 
-    def backward(self, alpha: Lanes, between: BoundSelfContacts | None) -> tuple[Any, Lanes]:
+    def backward(self, alpha: Lanes, between: ContactList | None) -> tuple[Any, Lanes]:
         """See `Elimination`; the node is the lanes' columns of P with r, C, and Q with r_o."""
         problem = self.problem
         team = self.team
-        assert between is not None
-        between.update_constraints(alpha)
+        sides = problem.sides
+        assert sides is not None and between is not None
+        sides.update_constraints(between, alpha)
         for contacts in problem.per_link:
-            contacts.update_constraints(alpha)  # type: ignore[attr-defined]
+            self._update_rings(contacts, alpha)
 
         def add_link(p, forces, force, column):
             return p + jnp.where(forces, force, column)
@@ -233,12 +241,48 @@ class TeamElimination(Elimination):
         none = zeros((6,), self.like)
         start = [none] * 3, zeros((), self.like)
         (p, c, q), work = loop(self.links, step, start, self.block.size, reverse=True)
-        first = between.wrench_on(0)
+        first = sides.wrench_on(0)
         p = lanewise(add_link, p, team.forces, first, none)
         whole = self.block.fold(self.block.over_team(work.lane, jnp.add), jnp.add)
         return self.block.sum((p, c, q)), lanes([whole], (), wide=False)
 
+    def _update_rings(self, contacts: ContactList, alpha: Lanes) -> None:
+        """Adds the last step of the line search to jar; stores Hessians and forces of rings."""
+
+        def store(item: Item) -> None:
+            def touches() -> None:
+                force = contacts.update_constraint(item, contacts.place(item), alpha)
+                contacts.write(TeamRing.force, force, item)
+
+            jax.lax.cond(contacts.touching(item), touches, lambda: None)
+
+        contacts.each(store)
+
+    def _columns(self, contacts: ContactList, i: Any) -> Lanes:
+        """The lanes' columns (6,) of the sum of X'KX over the contacts of link i's rings.
+
+        The lanes of the forces have their wrench.
+        """
+
+        def column(sums, place, cone, hessian, force, unit, forces):
+            c = make_contacts(place, cone)
+            response = jnp.where(forces, force, symmetric_times(hessian, c.relative(unit[:, None])))
+            return sums + contact.contact_wrench(c, response)[:, 0]
+
+        sums = zeros((6,), self.like)
+        for item in (at(i * self.rings + j) for j in range(self.rings)):
+
+            def add(item: Item = item, sums: Lanes = sums) -> Lanes:
+                kept = [contacts.read(name, item) for name in (TeamRing.hessian, TeamRing.force)]
+                args = contacts.place(item), contacts.cone_at(item), *kept
+                return lanewise(column, sums, *args, self.unit, self.team.forces)
+
+            sums = choose(contacts.touching(item), add, sums, self.block.size)
+        return sums
+
     def with_contacts(self, node: list[Lanes], i: Any) -> list[Lanes]:
+        """Adds the contacts of a link's rings to a node's columns."""
+
         def add(node, columns, held, forces):
             p, c, q = node
             return [p + columns, c + held, q + jnp.where(forces, -held, held)]
@@ -246,8 +290,10 @@ class TeamElimination(Elimination):
         none = zeros((6,), self.like)
         forces = self.team.forces
         for contacts in self.problem.per_link:
-            columns = contacts.columns(i, self.rings, self.unit, forces)  # type: ignore[attr-defined]
-            node = lanewise(add, node, columns, columns if contacts.set.on_object else none, forces)
+            columns = self._columns(contacts, i)
+            node = lanewise(
+                add, node, columns, columns if contacts.layout.on_object else none, forces
+            )
         return node
 
     def at_palm(self, now: Iterate, node: Any, slots: dict) -> tuple[Iterate, Eliminated]:
@@ -385,7 +431,7 @@ class TeamCoupling(Coupling):
             team.scratch.put(Side.link_acc, link_acc, i + 1)
             return team.as_lanes(link_acc)
 
-        self.contacts.put(Side.link_acc, self.problem.widened(step.palm_acc), 0)
+        self.sides.put(Side.link_acc, self.problem.widened(step.palm_acc), 0)
         loop(self.links, link, team.as_lanes(palm + 0 * obj), self.block.size)
 
 
@@ -398,7 +444,7 @@ class TeamLineSearch(LineSearch):
         self.rings = problem.memory.layout.rings_per_link
 
     def prepare(
-        self, now: Iterate, step: Iterate, between: BoundSelfContacts | None
+        self, now: Iterate, step: Iterate, between: ContactList | None
     ) -> tuple[Lanes, Lanes, Lanes]:
         """Substitutes back and prepares the line search.
 
@@ -412,7 +458,8 @@ class TeamLineSearch(LineSearch):
         """
         problem = self.problem
         team = self.team
-        assert between is not None
+        sides = problem.sides
+        assert sides is not None and between is not None
         palm, obj = (chosen(self.block, v) for v in (step.palm_acc, step.object_acc))
         first = team.as_lanes(jnp.where(self.block.mate == 0, jnp.ones_like(self.like), 0.0))
 
@@ -438,23 +485,34 @@ class TeamLineSearch(LineSearch):
             )
             return team.as_lanes(part), sums
 
-        between.put(Side.link_acc, problem.widened(step.palm_acc), 0)
+        sides.put(Side.link_acc, problem.widened(step.palm_acc), 0)
         start = team.as_lanes(palm + 0 * obj), [zeros((), self.like)] * 2
         _, (slope, curvature) = loop(self.links, link, start, self.block.size)
         touch = self.prepare_slots(zeros((), self.like), step)
-        terms = [lanewise(jnp.multiply, touch, first), between.prepare_all()]
+        terms = [lanewise(jnp.multiply, touch, first), sides.prepare_all(between)]
         for contacts in problem.per_link:
-            terms.append(contacts.prepare_all(between, self.rings, step.object_acc))  # type: ignore[attr-defined]
+            terms.append(self._prepare_rings(contacts, sides, step))
         touch = lanewise(lambda t: total(t), terms)
         slope, curvature, touch = self.total([slope, curvature, touch])
         slope, curvature = lanewise(with_palm_and_object, now, step, problem.palm, slope, curvature)
         return slope, curvature, touch
 
+    def _prepare_rings(self, contacts: ContactList, sides: Sides, step: Iterate) -> Lanes:
+        """`prepare_linesearch` of the fingers' rings; slopes at 0, each on its lane."""
+
+        def add(item: Item, sums: Lanes) -> Lanes:
+            row = jax.lax.div(item.number, jnp.full_like(item.number, self.rings)) + 1
+            link_acc = sides.table.gather(Side.link_acc, row, self.block.column)
+            acc = relative(contacts.layout.name, link_acc, step.palm_acc, step.object_acc)
+            return lanewise(jnp.add, sums, contacts.prepare_linesearch(item, acc))
+
+        return contacts.fold(add, zeros((), self.like))
+
     def total(self, sums: list[Lanes]) -> list[Lanes]:
         """Sums of lanes over the teams of each world."""
         return self.block.sum([team_sum(self.block, v) for v in sums])
 
-    def contact_slopes(self, alpha: Lanes, between: BoundSelfContacts | None) -> list[Lanes]:
+    def contact_slopes(self, alpha: Lanes, between: ContactList | None) -> list[Lanes]:
         """Slope and curvature of the contacts' cost along the step, sums of each finger's contacts.
 
         Args:
@@ -469,10 +527,10 @@ class TeamLineSearch(LineSearch):
             return lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
 
         for c in problem.dealt:
-            sums = c.fold_items(lambda item, s, c=c: plus(s, c.slopes(item, alpha)), sums)
+            sums = c.fold(lambda item, s, c=c: plus(s, c.slopes(item, alpha)), sums)
         sums = [lanewise(jnp.multiply, v, first) for v in sums]
         for c in problem.per_link:
-            sums = c.fold_items(lambda item, s, c=c: plus(s, c.slopes(item, alpha)), sums)
+            sums = c.fold(lambda item, s, c=c: plus(s, c.slopes(item, alpha)), sums)
         assert between is not None
         return between.slopes_of_all(alpha, sums)
 

@@ -14,6 +14,7 @@ from jax.experimental import pallas as pl
 from codesign_jax.compiler import thread, vector
 from codesign_jax.compiler.launch import Kernel, describe, kernel_jaxpr, launch
 from codesign_jax.compiler.values import Array, Layout
+from scripts import same_kernels
 
 pytestmark = pytest.mark.usefixtures("optimized_kernels")
 BACKENDS = ["cpu", pytest.param("gpu", marks=pytest.mark.gpu)]
@@ -375,6 +376,51 @@ def test_lanes_exchange_through_memory(backend):
     rounds = [each * (np.arange(4) + k)[:, None] for k in range(3)]
     want = sum(2 * np.einsum("bmc,m->bc", r, [1, 2, 4, 8]) for r in rounds)
     np.testing.assert_array_equal(got, np.tile(want[:, None], (1, 1, 4)))
+
+
+SUMS = """entry:
+br label %L1
+L1:
+%v1 = phi i32 [ 0, %entry ], [ %v6, %L1 ]
+%v2 = getelementptr float, ptr %a0, i32 %v1
+%v3 = load float, ptr %v2
+%v4 = load float, ptr %a1
+%v5 = fadd float %v3, %v4
+store float %v5, ptr %v2
+%v6 = add i32 %v1, 1
+br label %L1"""
+REORDERED = """entry:
+br label %L1
+L1:
+%v1 = phi i32 [ 0, %entry ], [ %v2, %L1 ]
+%v2 = add i32 %v1, 1
+%v3 = load float, ptr %a1
+%v4 = getelementptr float, ptr %a0, i32 %v1
+%v5 = load float, ptr %v4
+%v6 = fadd float %v5, %v3
+store float %v6, ptr %v4
+br label %L1"""
+OTHER_KERNELS = {
+    "another step of the loop": ("add i32 %v1, 1", "add i32 %v1, 2"),
+    "another value": ("fadd float %v5, %v3", "fadd float %v5, %v5"),
+    "another address": ("store float %v6, ptr %v4", "store float %v6, ptr %a1"),
+    "a load behind the store": (
+        "%v6 = fadd float %v5, %v3\nstore float %v6, ptr %v4",
+        "store float %v3, ptr %v4\n%v6 = load float, ptr %a1\nstore float %v6, ptr %v4",
+    ),
+}
+
+
+def test_kernels_are_the_same_but_for_the_order_of_operations():
+    assert REORDERED != SUMS
+    assert same_kernels.without_order(REORDERED) == same_kernels.without_order(SUMS)
+
+
+@pytest.mark.parametrize("change", OTHER_KERNELS.values(), ids=OTHER_KERNELS)
+def test_kernels_that_compute_something_else_are_not_the_same(change):
+    other = REORDERED.replace(*change)
+    assert other != REORDERED
+    assert same_kernels.without_order(other) != same_kernels.without_order(SUMS)
 
 
 def test_a_gpu_exchanges_on_its_chip_between_barriers():

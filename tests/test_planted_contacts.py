@@ -51,7 +51,7 @@ HELD = "_with_held"
 HOLD = "sums.<locals>.add"
 KEEP = "quotient"
 RINGS_HELD = "with_held"
-RINGS_HOLD = "_keep_of_set.<locals>.after"
+RINGS_HOLD = "_keep_of_list.<locals>.after"
 TURN = "in_world"
 RAY = "cost_along_line"
 SLOPES = "slopes_along_line"
@@ -146,7 +146,7 @@ def own_half(right, mine, self, contacts, item):
 
 def one_side(right, mine, self, contacts, item, field, more, *rest):
     """A finger does not feel the other side of its contact with itself, nor the palm fingers."""
-    left = chosen(mine, lanewise(lambda m: 0 * m, more), more) if field == "other" else more
+    left = chosen(mine, lanewise(lambda m: 0 * m, more), more) if field == "other_side" else more
     right(self, contacts, item, field, left, *rest)
 
 
@@ -175,8 +175,10 @@ def passed_over(right, mine, self, busy):
 
 def on_parent(right, mine, self, row, which, owner, side, other, alike):
     """Contacts between fingers act on the link before theirs."""
-    behind = lanewise(lambda r: jnp.maximum(r - 1, 0), side["row"])
-    right(self, row, which, owner, side | {"row": chosen(mine, behind, side["row"])}, other, alike)
+    behind = lanewise(lambda r: jnp.maximum(r - 1, 0), side["side"])
+    right(
+        self, row, which, owner, side | {"side": chosen(mine, behind, side["side"])}, other, alike
+    )
 
 
 def same_way(right, mine, self, row, which, owner, side, other, alike):

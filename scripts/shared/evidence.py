@@ -77,6 +77,12 @@ SIMULATION = (
     "objects/*.toml",
 )
 """Files that decide what a grasp does and how fast it is computed."""
+SAME: dict[str, str] = {}
+"""Digests of code that was rearranged, with the digest of the code before.
+
+Its figures are those of the older code: `scripts.same_kernels` finds that the kernels are the same,
+or have the same operations in another order.
+"""
 BLOCK = re.compile(r"<!-- version:begin -->.*?<!-- version:end -->\n\n", re.S)
 
 
@@ -88,7 +94,10 @@ def version(root: Path = ROOT) -> str:
 
 @functools.cache
 def kernel(root: Path = ROOT) -> str:
-    """Digest of the code and constants of a simulation, without comments and docstrings."""
+    """Digest of the code and constants of a simulation, without comments and docstrings.
+
+    Of code that was rearranged it is that of the code before, see `SAME`.
+    """
     digest = hashlib.sha256()
     for pattern in SIMULATION:
         paths = sorted(root.glob(pattern))
@@ -96,7 +105,12 @@ def kernel(root: Path = ROOT) -> str:
             raise ValueError(f"no file is {pattern}: what a simulation computes has moved")
         for path in paths:
             digest.update(f"{path.relative_to(root)}\n{_content(path)}\n".encode())
-    return digest.hexdigest()[:8]
+    return first_of(digest.hexdigest()[:8])
+
+
+def first_of(digest: str) -> str:
+    """The digest of the first code that computes the same as that of a digest."""
+    return SAME.get(digest, digest)
 
 
 def _content(path: Path) -> str:
@@ -144,7 +158,7 @@ def measured_with(data: Path, patterns: tuple[str, ...]) -> set[tuple[str, str]]
     """Versions and kernels of the measurements in files of a folder."""
     paths = sorted({path for pattern in patterns for path in data.glob(pattern)})
     made = [r for path in paths for r in records(json.loads(path.read_text(encoding="utf-8")))]
-    return {(record.get("version", FIRST_VERSION), record["kernel"]) for record in made}
+    return {(record.get("version", FIRST_VERSION), first_of(record["kernel"])) for record in made}
 
 
 def mark(measured: set[tuple[str, str]], present: tuple[str, str]) -> str:

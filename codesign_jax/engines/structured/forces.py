@@ -18,7 +18,7 @@ from codesign_jax.scene import Scene
 from codesign_jax.types import Forces, Touch
 
 Recorded = dict[str, jax.Array]
-"""What a kernel has recorded, by contact set and field, shape (world, time, item, ..., finger)."""
+"""What a kernel has recorded, by contact list and field, shape (world, time, item, ..., finger)."""
 
 
 def of_rollout(program: Program, out: Outputs, worlds: int) -> Forces:
@@ -109,7 +109,7 @@ def _summed(program: Program, recorded: Recorded, none: jax.Array) -> Forces:
     vector = jnp.zeros((*none.shape[:2], 1, 3, none.shape[2]), none.dtype)
 
     def net(name: str) -> jax.Array:
-        """Force of a set on each lane, shape (world, time, 3, finger)."""
+        """Force of a list on each lane, shape (world, time, 3, finger)."""
         return recorded.get(f"{name}.force", vector)[:, :, 0]
 
     def of_fingers(name: str) -> jax.Array:

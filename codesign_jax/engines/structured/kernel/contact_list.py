@@ -241,7 +241,7 @@ class ContactList:
         mixed = self.layout.with_itself and touches_itself(self.layout.scene)
 
         def slot(item: Item, carry: Any) -> Any:
-            other = self.read(Slot.other, item).lane if mixed else None
+            other = self.read(Slot.other_side, item).lane if mixed else None
             return body(item._replace(pairing=pairing, cone=self.cone_of_row(row, other)), carry)
 
         return self.layout.slots.fold_row(self.cells, row, slot, start)
@@ -320,7 +320,7 @@ class ContactList:
         more = {}
         if hold is not None:
             jar = lanewise(with_held, jar, place, self.cone_at(item), hold[0])
-            more = {Contact.held: hold[1]}
+            more = {Contact.held_friction: hold[1]}
         self.write(Contact.share, place.share, item)
 
         def store() -> None:
@@ -354,7 +354,7 @@ class ContactList:
         def compute() -> list[Lanes]:
             # All is read before anything is stored, see `sides.OwnSide`.
             jar = self.read(Contact.jar, item)
-            step = self.read(Contact.step, item)
+            step = self.read(Contact.jar_step, item)
             place = self.place(item)
             jar = lanewise(tree_add_scaled, alpha, jar, step)
             self.write(Contact.jar, jar, item)
@@ -374,7 +374,7 @@ class ContactList:
 
         def compute() -> list[Lanes]:
             jar = self.read(Contact.jar, item)
-            step = self.read(Contact.step, item)
+            step = self.read(Contact.jar_step, item)
             given = self.place(item), self.cone_at(item), alpha, jar, step
             return [lanewise(response, *given)]
 
@@ -392,7 +392,7 @@ class ContactList:
             return update.hessian, update.force
 
         jar = lanewise(
-            tree_add_scaled, alpha, self.read(Contact.jar, item), self.read(Contact.step, item)
+            tree_add_scaled, alpha, self.read(Contact.jar, item), self.read(Contact.jar_step, item)
         )
         self.write(Contact.jar, jar, item)
         hessian, force = lanewise(response, place, self.cone_at(item), jar)
@@ -406,7 +406,7 @@ class ContactList:
             return contact.constraint_update(make_contacts(place, cone), jar + alpha * step).force
 
         jar = self.read(Contact.jar, item)
-        step = self.read(Contact.step, item)
+        step = self.read(Contact.jar_step, item)
         return lanewise(response, place, self.cone_at(item), alpha, jar, step)
 
     @staticmethod
@@ -449,7 +449,7 @@ class ContactList:
         """Stores the contacts' cost along a change of jar; returns its slope at 0."""
         given = self.place(item), self.cone_at(item), self.read(Contact.jar, item), change
         line, slope = lanewise(cost_along_line, *given)
-        self.write(Contact.step, change, item)
+        self.write(Contact.jar_step, change, item)
         self.write(Contact.ray, line, item)
         return slope
 
@@ -558,7 +558,7 @@ class ContactList:
         pairing = item.pairing
         kept = jnp.ones_like(self.like)
         if pairing.itself is not None:
-            palm = pairing.itself & (self.read(Slot.other, item).lane < 0.5)
+            palm = pairing.itself & (self.read(Slot.other_side, item).lane < 0.5)
             kept = jnp.where(palm, 0.0, kept)
         return lanes([kept], (), wide=True)
 
@@ -567,7 +567,7 @@ class ContactList:
 
         def deeper(item: Item, depth: Lanes) -> Lanes:
             fields = (self.read(name, item)[0] for name in (Contact.share, Contact.gap))
-            return lanewise(_deeper_in_palm, depth, self.read(Slot.other, item)[0, 0], *fields)
+            return lanewise(_deeper_in_palm, depth, self.read(Slot.other_side, item)[0, 0], *fields)
 
         return self.layout.slots.fold_row(self.cells, 0, deeper, depth)
 
@@ -643,7 +643,7 @@ def with_held(jar: jax.Array, place: Place, cone: Cone, held_friction: jax.Array
 
 def fields_of(place: Place, jar: Lanes) -> dict[str, Lanes]:
     """What is kept of new contacts, by field."""
-    return {**place._asdict(), Contact.jar: jar, Contact.step: lanewise(jnp.zeros_like, jar)}
+    return {**place._asdict(), Contact.jar: jar, Contact.jar_step: lanewise(jnp.zeros_like, jar)}
 
 
 def as_candidates(

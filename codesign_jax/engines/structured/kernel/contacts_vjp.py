@@ -212,7 +212,7 @@ class ContactsVjp:
         fixed = fixed | {Contact.share: contacts.read(Contact.share, item)}
         held = {}
         if contacts.layout.holds:
-            held = {Contact.held: contacts.read(Contact.held, item)}
+            held = {Contact.held_friction: contacts.read(Contact.held_friction, item)}
             fixed |= {HeldBar.held_bar: contacts.read(HeldBar.held_bar, item)}
         run = partial(kinds.power, self.layout.scene, contacts.layout.name)
         mine, _, bars, held_bars = pull(run, (mine, (), numbers, held), (fixed,), self.power_bar)
@@ -272,7 +272,7 @@ class ContactsVjp:
         effects = self.layout.scene.effects
         by_pair = {}
         if pairing.itself is not None:
-            other = contacts.read(Slot.other, item).lane.astype(jnp.int32)
+            other = contacts.read(Slot.other_side, item).lane.astype(jnp.int32)
             itself = live & pairing.itself
             by_pair = {"finger_palm": itself & (other == 0), "finger_itself": itself & (other > 0)}
             live = live & ~pairing.itself
@@ -322,9 +322,9 @@ class ContactsVjp:
             return self._sphere(pairing, jax.lax.div(remembered, self._count))
         itself = pair == "finger_itself"
         if itself:
-            link = contacts.read(Slot.other, item).lane.astype(jnp.int32)
+            link = contacts.read(Slot.other_side, item).lane.astype(jnp.int32)
         else:
-            link = pairing.swap(contacts.read(Slot.row, item)).lane.astype(jnp.int32)
+            link = pairing.swap(contacts.read(Slot.side, item)).lane.astype(jnp.int32)
         last = jnp.where(link == self.layout.links, self.like + 1.0, self.like)
         end: Any = 1
         if itself:

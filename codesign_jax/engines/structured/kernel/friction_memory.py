@@ -4,7 +4,7 @@ Its law is `holding.held`.  What is held is state, `model.held`:
 
 * A contact of a distance field, of fingers, palm and object with object, table and fixtures, holds
   three numbers of its own, along the object's axes if it is on the object, which it turns with, and
-  else along the world's.  Within a step they are "held" of the contact, first those before the
+  else along the world's.  Within a step they are `Contact.held_friction`, first those before the
   step, then those behind it.
 * Fingers that touch one another hold three numbers for each of their pairings, on both fingers'
   lanes, equal and opposite: all contacts of two fingers share them, as none of them stays at one
@@ -97,7 +97,7 @@ def store(step: StepMemory, good: jax.Array) -> None:
 
 
 def _store(step: StepMemory, contacts: ContactList, mask: Lanes) -> None:
-    """Ends a step of a set's contacts; what does not touch holds nothing."""
+    """Ends a step of a list's contacts; what does not touch holds nothing."""
     name = f"held.{contacts.layout.name}"
     state = step.finger_state
     k = contacts.layout.k
@@ -107,7 +107,7 @@ def _store(step: StepMemory, contacts: ContactList, mask: Lanes) -> None:
 
     def store_item(item: jax.Array, x: jax.Array) -> jax.Array:
         share = contacts.read(Contact.share, at(item))
-        new = contacts.read(Contact.held, at(item))
+        new = contacts.read(Contact.held_friction, at(item))
         for j in range(k):
             old = state.read(name, item * k + j)
             state.write(name, lanewise(after, mask, share[j], new[:, j], old), item * k + j)
@@ -126,7 +126,7 @@ def sums(self_contacts: ContactList, row: Any, alpha: Lanes, held_friction: Lane
 
     def slot(item: Item, sums: Lanes) -> Lanes:
         jar = self_contacts.read(Contact.jar, item)
-        step = self_contacts.read(Contact.step, item)
+        step = self_contacts.read(Contact.jar_step, item)
         counts = self_contacts.held_part(item)
         contact_numbers = self_contacts.place(item), self_contacts.cone_at(item)
         return lanewise(add, sums, *contact_numbers, alpha, jar, step, held_friction, counts)
@@ -141,7 +141,7 @@ def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
     def keep_all() -> None:
         for contacts in some:
-            _keep_of_set(problem, contacts, alpha, lanes([which], (), wide=True))
+            _keep_of_list(problem, contacts, alpha, lanes([which], (), wide=True))
 
     if some:
         any_of(which, keep_all)
@@ -149,8 +149,8 @@ def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         _keep_of_fingers(problem, alpha, which)
 
 
-def _keep_of_set(problem: Problem, contacts: ContactList, alpha: Lanes, mask: Lanes) -> None:
-    """Keeps what a set's contacts hold behind the step, in the worlds of the mask."""
+def _keep_of_list(problem: Problem, contacts: ContactList, alpha: Lanes, mask: Lanes) -> None:
+    """Keeps what a list's contacts hold behind the step, in the worlds of the mask."""
     axes = held_axes(problem.memory, contacts)
 
     def after(mask, place, cone, alpha, jar, step, old, axes):
@@ -161,11 +161,10 @@ def _keep_of_set(problem: Problem, contacts: ContactList, alpha: Lanes, mask: La
         def store() -> None:
             place = contacts.place(item)
             cone = contacts.cone_at(item)
-            jar, step, old = (
-                contacts.read(n, item) for n in (Contact.jar, Contact.step, Contact.held)
-            )
+            fields = Contact.jar, Contact.jar_step, Contact.held_friction
+            jar, step, old = (contacts.read(name, item) for name in fields)
             new = lanewise(after, mask, place, cone, alpha, jar, step, old, axes)
-            contacts.write(Contact.held, new, item)
+            contacts.write(Contact.held_friction, new, item)
 
         jax.lax.cond(contacts.touching(item), store, lambda: None)
 
@@ -230,7 +229,7 @@ def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
 
 
 def _reverse(step: StepMemory, bars: CotangentTables, contacts: ContactList, go: Lanes) -> None:
-    """Leaves the cotangents of a set's contacts as "held_bar"."""
+    """Leaves the cotangents of a list's contacts as "held_bar"."""
     rest = lanewise(jnp.logical_not, go)
 
     def reverse_item(item: Item) -> None:
@@ -257,10 +256,10 @@ def _write_bars(bars: CotangentTables, contacts: ContactList, item: Item, value:
 
 
 def add_held(bars: CotangentTables, contacts: ContactList, item: Item, held: dict) -> None:
-    """Adds an item's cotangents of what its contacts hold, "held", to those of the state."""
+    """Adds an item's cotangents of what its contacts hold to those of the state."""
     if contacts.layout.holds:
         old = held_bars(bars, contacts, item)
-        _write_bars(bars, contacts, item, plus(old, held["held"]))
+        _write_bars(bars, contacts, item, plus(old, held[Contact.held_friction]))
 
 
 def wrench_of_cotangents(problem: Problem, contacts: ContactList, item: Item) -> Lanes:
@@ -280,7 +279,7 @@ def wrench_of_cotangents(problem: Problem, contacts: ContactList, item: Item) ->
         place = contacts.place(item)
         cone = contacts.cone_at(item)
         jar, held, bars = (
-            contacts.read(n, item) for n in (Contact.jar, Contact.held, HeldBar.held_bar)
+            contacts.read(n, item) for n in (Contact.jar, Contact.held_friction, HeldBar.held_bar)
         )
         unit = lanes([problem.like + 1.0], (), wide=True)
         (change,) = pull(of_jar, (jar,), (place, cone, held, bars, axes), unit)
@@ -316,26 +315,26 @@ def _reverse_fingers(
 def held_and_cotangents(
     step: StepMemory, pairing: FingerPairing
 ) -> tuple[dict[str, Lanes], dict[str, Lanes]]:
-    """What the lanes' fingers hold, "held", and "sums_bar"; nothing without such a state."""
+    """What the lanes' fingers hold and "sums_bar", by name; nothing without such a state."""
     if not pairings(step):
         return {}, {}
     item = pairing.number
     lane = step.block.lane
     held = step.finger_state.gather(BETWEEN_FINGERS, item, lane)
     sums_bar = step.scratch.gather(Virtual.sums_bar, item, lane)
-    return {Contact.held: held}, {Virtual.sums_bar: sums_bar}
+    return {Contact.held_friction: held}, {Virtual.sums_bar: sums_bar}
 
 
 def add_pairing_cotangents(
     bars: CotangentTables, pairing: FingerPairing, held: dict[str, Lanes]
 ) -> None:
-    """Adds a contact's cotangents of what fingers hold, "held", to those of the state."""
+    """Adds a contact's cotangents of what fingers hold to those of the state."""
     if not held:
         return
     item = pairing.number
     lane = bars.block.lane
     state = bars.finger_state
-    new = lanewise(jnp.add, state.gather(BETWEEN_FINGERS, item, lane), held[Contact.held])
+    new = lanewise(jnp.add, state.gather(BETWEEN_FINGERS, item, lane), held[Contact.held_friction])
     state.scatter(BETWEEN_FINGERS, new, item, lane)
 
 

@@ -286,8 +286,8 @@ def power(
       pair: Name of a kind in `KINDS`.
       mine: The first side, `theirs`: the second, see `Kind`; nothing for what is in `numbers`.
       numbers: The object's state and constants of the world, by name, among them the cone's.
-      held: Friction that they hold, "held": (3, k) of contacts, in the object's axes on the object,
-        (3,) of a pairing; nothing where they hold none.
+      held: Friction that they hold, "held_friction": (3, k) of contacts, in the object's axes on
+        the object, (3,) of a pairing; nothing where they hold none.
       fixed: What has no derivative: "share" of the contacts, zero of those that do not count, the
         object's accelerations, indices, values of grids, and "held_bar" or "sums_bar".
     """
@@ -302,7 +302,7 @@ def power(
     if not held:
         return sum_axis(dot(contact.constraint_update(contacts, jar).force, along), 0)
     of_contacts = kind.holds == "contact"
-    friction = held["held"] if of_contacts else held["held"][:, None]
+    friction = held["held_friction"] if of_contacts else held["held_friction"][:, None]
     axes = numbers["columns"] if pair.endswith("_object") else None
     in_world = friction if axes is None else apply_columns(axes, friction)
     jar = jar + holding.held(contacts, in_world)

@@ -45,8 +45,8 @@ def steady(problem: Problem, alpha: Lanes, between: ContactList | None) -> jax.A
     def add(item: Item, sums: Lanes, contacts: ContactList) -> Lanes:
         return lanewise(jnp.add, sums, contacts.changes(item, alpha))
 
-    sets = [*problem.dealt, *problem.per_link, *([between] if between else [])]
-    for contacts in sets:
+    lists = [*problem.dealt, *problem.per_link, *([between] if between else [])]
+    for contacts in lists:
         count = contacts.fold(partial(add, contacts=contacts), count)
     if block.team > 1:
         count = team_sum(block, count)

@@ -125,7 +125,7 @@ class Elimination:
         """Contact inertia (6, 6, ...) and wrench (6, ...) of an item's contacts at a step's length.
 
         Args:
-          contacts: A contact set.
+          contacts: A contact list.
           item: The item: a link, or a group.
           alpha: Length of the last Newton step, by which jar is still behind, lanes of a world.
         """

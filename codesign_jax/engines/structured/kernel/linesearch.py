@@ -130,16 +130,16 @@ class LineSearch:
           between: As in `prepare`.
         """
 
-        def add(item: Item, sums: list, sets: list) -> list:
-            for contacts in sets:
+        def add(item: Item, sums: list, lists: list) -> list:
+            for contacts in lists:
                 new = contacts.slopes(item, alpha)
                 sums = lanewise(lambda a, b: jax.tree.map(jnp.add, a, b), sums, new)
             return sums
 
         problem = self.problem
         sums = [zeros((), self.like)] * 2
-        if sets := problem.per_link:
-            sums = loop(self.links, lambda i, s: add(at(i), s, sets), sums, self.block.size)
+        if lists := problem.per_link:
+            sums = loop(self.links, lambda i, s: add(at(i), s, lists), sums, self.block.size)
         for c in problem.dealt:
             sums = c.fold(lambda item, s, c=c: add(item, s, [c]), sums)
         if between:

@@ -41,7 +41,7 @@ from codesign_jax.engines.structured.laws import holding
 
 
 def groups(layout: Any) -> dict[str, Group]:
-    """Rows that a kernel's layout records, by the name of a contact set and of a field."""
+    """Rows that a kernel's layout records, by the name of a contact list and of a field."""
     recorded: dict[str, Group] = {}
     for contacts in layout.lists:
         for table in tables(layout, contacts):
@@ -51,7 +51,7 @@ def groups(layout: Any) -> dict[str, Group]:
 
 
 def tables(layout: Any, contacts: ContactLayout) -> tuple:
-    """The declarations of what is recorded of a set."""
+    """The declarations of what is recorded of a list."""
     if contacts.of_hand:
         return (PairForce,)
     return (ForceSum, TouchForce) if contacts.stores_all else (ForceSum,)
@@ -72,12 +72,12 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
 
     def moved(contacts: ContactList, item: Item) -> Lanes:
         jar = contacts.read(Contact.jar, item)
-        return lanewise(_moved, mask, jar, alpha, contacts.read(Contact.step, item))
+        return lanewise(_moved, mask, jar, alpha, contacts.read(Contact.jar_step, item))
 
     def put(contacts: ContactList, item: Item, jar: Lanes) -> None:
-        old = contacts.read(Contact.step, item)
+        old = contacts.read(Contact.jar_step, item)
         contacts.write(Contact.jar, jar, item)
-        contacts.write(Contact.step, lanewise(_zero_where, mask, old), item)
+        contacts.write(Contact.jar_step, lanewise(_zero_where, mask, old), item)
 
     for contacts in (*problem.per_link, *problem.dealt):
 
@@ -106,7 +106,7 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
 
 
 def _chord_of(problem: Problem, contacts: ContactList, item: Item, chord: Iterate) -> Lanes:
-    """Change of a set's relative acceleration by the chord step, shape (6,)."""
+    """Change of a list's relative acceleration by the chord step, shape (6,)."""
     name = contacts.layout.name
     link = None
     if contacts.layout.per_link:
@@ -117,13 +117,13 @@ def _chord_of(problem: Problem, contacts: ContactList, item: Item, chord: Iterat
 def write(step: StepMemory, table: BoundTable) -> None:
     """Writes the forces of the step's contacts, at its accelerations; before it is integrated."""
     for contacts in step.field_contacts:
-        _write_set(step, contacts.layout.name, contacts, table)
+        _write_list(step, contacts.layout.name, contacts, table)
     if (pairs := step.self_contacts) is not None:
         _each(pairs.layout.slots.rows, lambda row: _write_pairing(step, pairs, row, table))
 
 
-def _write_set(step: StepMemory, name: str, contacts: ContactList, table: BoundTable) -> None:
-    """Writes what a set's contacts do, and with `stores_all` each of them."""
+def _write_list(step: StepMemory, name: str, contacts: ContactList, table: BoundTable) -> None:
+    """Writes what a list's contacts do, and with `stores_all` each of them."""
     energy = f"{name}.{ForceSum.energy}" in table
     none = [zeros((3,), step.like), *[zeros((), step.like)] * (2 + energy)]
 
@@ -147,7 +147,7 @@ def _write_set(step: StepMemory, name: str, contacts: ContactList, table: BoundT
 
 
 def _write_rings(step: StepMemory, name: str, contacts: ContactList, table: BoundTable) -> None:
-    """Writes place and force of each of a set's rings, those that do not touch as well."""
+    """Writes place and force of each of a list's rings, those that do not touch as well."""
     position = step.world_state.read(WorldState.position)
 
     def put(item: Item) -> None:
@@ -171,7 +171,7 @@ def _write_pairing(step: StepMemory, contacts: ContactList, row: Any, table: Bou
         itself = item.pairing.itself
         palm = jnp.zeros_like(step.like)
         if itself is not None:
-            other = contacts.read(Slot.other, item).lane
+            other = contacts.read(Slot.other_side, item).lane
             palm = jnp.where(itself & (other < 0.5), 1.0, palm)
         side = lanes([palm], (), wide=True)
         numbers = contacts.place(item), contacts.cone_at(item), contacts.read(Contact.jar, item)

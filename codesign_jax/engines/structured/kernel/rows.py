@@ -6,7 +6,7 @@ of items, and the shape of an item.  From the declarations follow layout, packin
 (`memory`), the tables of a scene (`memory_tables`) and those of cotangents (`cotangents`), which
 have a row for each constant.
 
-A field is read by `table.read(Hand.mass, link)`.  The fields of a contact belong to its set, so
+A field is read by `table.read(Hand.mass, link)`.  The fields of a contact belong to its list, so
 there are several of each: `contacts.read(Contact.jar, item)`.
 """
 
@@ -26,9 +26,9 @@ RING = "ring"  # rings, or balls, of a finger
 PALM_GROUP = "palm_group"  # groups of the palm's rings, one ring for each finger's lanes
 SUPPORT = "support"  # support points of a mesh, one for each finger's lanes
 PAIRING = "pairing"  # pairings of fingers that hold friction on one another
-ITEM = "item"  # of a contact set: links, groups, or slots
+ITEM = "item"  # of a contact list: links, groups, or slots
 SLOT_ROW = "slot_row"  # rows of slots
-TOUCH = "touch"  # contacts of a set that are recorded one by one
+TOUCH = "touch"  # contacts of a list that are recorded one by one
 
 # Axes of an item
 AXES = "axes"  # hinges of a joint
@@ -49,7 +49,7 @@ class Field(str):
     Attributes:
       items: Axis of the items.
       shape: Shape of an item: numbers, and axes.
-      on: Whether a kernel's layout, a contact set or a record has it.
+      on: Whether a kernel's layout, a `ContactLayout` or a record has it.
     """
 
     items: str
@@ -92,7 +92,7 @@ class Rows:
         """Items and shapes by name, of the fields that an owner has.
 
         Args:
-          owner: A kernel's layout, a contact set, or a record.
+          owner: A kernel's layout, a `ContactLayout`, or a record.
           sizes: Lengths of the axes.
         """
 
@@ -261,23 +261,23 @@ class Search(Rows, prefix="pair"):
 
 
 class Contact(Rows):
-    """The contacts of an item of a set; `laws.rings.Place` has the first four."""
+    """The contacts of an item of a list; `laws.rings.Place` has the first four."""
 
     point = field(ITEM, 3, CONTACTS)  # Place from the object's centre [m]
     normal = field(ITEM, 3, CONTACTS)
     gap = field(ITEM, CONTACTS)
     share = field(ITEM, CONTACTS)
     jar = field(ITEM, 3, CONTACTS)
-    step = field(ITEM, 3, CONTACTS)  # Change of jar by Newton's step
+    jar_step = field(ITEM, 3, CONTACTS)  # Change of jar by Newton's step
     ray = field(ITEM, RAY, CONTACTS)  # The cost along that step
     friction = field(ITEM, 1, CONTACTS, on=lambda contacts: contacts.friction_by_contact)
-    held = field(ITEM, 3, CONTACTS, on=lambda contacts: contacts.holds)
+    held_friction = field(ITEM, 3, CONTACTS, on=lambda contacts: contacts.holds)
 
 
 class Slot(Rows):
     """What a slot has beside its contact."""
 
-    row = field(ITEM, 1, CONTACTS)  # Body of each lane's side: 0 is the palm
+    side = field(ITEM, 1, CONTACTS)  # Body of each lane's side: 0 is the palm
     hessian = field(ITEM, 6, CONTACTS)  # Upper triangle of the Hessian by jar
     # What conjugate gradients keep, see `coupling`
     first_response = field(ITEM, 3, CONTACTS)
@@ -287,14 +287,14 @@ class Slot(Rows):
     direction_response = field(ITEM, 3, CONTACTS)
     force = field(ITEM, 3, CONTACTS)
     # Second side of contacts that a finger has with itself or the palm
-    other = field(ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself)
-    # The different rows of a slot's lanes, see `Sides.list_rows`
-    row_listed = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.slots.gathers)
-    row_count = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.slots.gathers)
-    other_listed = field(
+    other_side = field(ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself)
+    # The different sides of a slot's lanes, see `Sides.list_bodies`
+    side_listed = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.slots.gathers)
+    side_count = field(ITEM, 1, CONTACTS, on=lambda contacts: not contacts.slots.gathers)
+    other_side_listed = field(
         ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself and not contacts.slots.gathers
     )
-    other_count = field(
+    other_side_count = field(
         ITEM, 1, CONTACTS, on=lambda contacts: contacts.with_itself and not contacts.slots.gathers
     )
 
@@ -334,7 +334,7 @@ class Record(NamedTuple):
 
 
 class ForceSum(Rows):
-    """What is recorded of a set's contacts on each lane; conditions are of `Record`."""
+    """What is recorded of a list's contacts on each lane; conditions are of `Record`."""
 
     force = field(ONE, 3)  # On the first body [N], world axes
     pressing = field(ONE)  # Sum of the normal forces [N]
@@ -427,7 +427,7 @@ class Virtual(Rows):
 
 
 class HeldBar(Rows):
-    """Cotangents of what a set's contacts hold behind the step."""
+    """Cotangents of what a list's contacts hold behind the step."""
 
     held_bar = field(ITEM, 3, CONTACTS, on=lambda contacts: contacts.holds)
 

@@ -322,7 +322,7 @@ class SelfCollision:
         place, jar = self.contacts.begin(place, cone, acc, vel)
         for g in held:
             jar = lanewise(_with_held, jar, place, cone, g)
-        return fields_of(place, jar) | {Slot.row: self._number(row)}
+        return fields_of(place, jar) | {Slot.side: self._number(row)}
 
     def moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
         """Accelerations and velocities of links; arguments as `read`."""
@@ -372,7 +372,7 @@ class SelfCollision:
           candidate: See `candidate`.
           other: Link of the other side, 0 for the palm; `item`: the ring.
         """
-        candidate |= {Slot.other: self._number(other)}
+        candidate |= {Slot.other_side: self._number(other)}
         candidate |= self.contacts.remembered({Remembered.owner: 1.0, Remembered.ring: item})
         which = mine & (candidate[Contact.share].lane > 0)
         any_of(which, lambda: self.contacts.append(0, which, candidate))
@@ -510,18 +510,20 @@ class SelfCollision:
           second: Lanes of the other finger, if they have looked; else the owners have.
         """
         which = near & (contact[Contact.share].lane > 0)
-        step = contact[Contact.step]
-        mine = {name: value for name, value in contact.items() if name != Contact.step}
-        theirs = mine | {Slot.row: self._number(other)}
+        step = contact[Contact.jar_step]
+        mine = {name: value for name, value in contact.items() if name != Contact.jar_step}
+        theirs = mine | {Slot.side: self._number(other)}
         theirs |= {
             name: lanewise(jnp.negative, mine[name]) for name in (Contact.normal, Contact.jar)
         }
-        none = {Slot.other: zeros((1, 1), self.like)} if self.contacts.layout.with_itself else {}
+        none = {}
+        if self.contacts.layout.with_itself:
+            none = {Slot.other_side: zeros((1, 1), self.like)}
 
         alike = (
             self.contacts.remembered({Remembered.owner: owner, Remembered.ring: item})
             | none
-            | {Contact.step: step}
+            | {Contact.jar_step: step}
         )
         fields = (mine, theirs) if second is None else (theirs, mine)
         finder = owner if second is None else second

@@ -4,8 +4,8 @@ The side of a contact is a body of the lane's own finger: a link, or 0 for the p
 links that are fixed to it.  Contacts with a field have no side here: their link is at hand where a
 pass over the links looks at them.
 
-Which lanes have their side where differs.  On GPUs each lane reads the row of its own side; on CPUs
-the few different rows of a slot's lanes are listed, and a pass goes from one to the next.  The
+The lanes of a block have a slot's contact on different bodies.  On GPUs each lane reads its own;
+on CPUs the few different bodies of a slot are listed, and a pass goes from one to the next.  The
 lanes of a team keep the wrench of a slot each, and add them up when a pass has ended.
 """
 
@@ -42,9 +42,9 @@ class OwnSide(NamedTuple):
     """
 
     place: Place  # Where the contact is
-    # Row of each lane's side, int32, shape (lane,); None where nothing is added to it at once
-    row: jax.Array | None
-    wrench: Lanes | None  # Wrench of all contacts so far on that row, (6, ...); None likewise
+    # Body of each lane's side, int32, shape (lane,); None where nothing is added to it at once
+    body: jax.Array | None
+    wrench: Lanes | None  # Wrench of all contacts so far on that body, (6, ...); None likewise
 
 
 class Sides:
@@ -60,7 +60,7 @@ class Sides:
           table: The table.
           block: The lanes.
           bodies: Moving links of a finger and the palm.
-          gathers: Whether each lane reads the row of its own side.
+          gathers: Whether each lane reads the body of its own side.
         """
         self.table = table
         self.block = block
@@ -71,22 +71,22 @@ class Sides:
 
     # The bodies
 
-    def put(self, name: Field, value: Lanes, row: Any) -> None:
-        """Stores a field of a body; row 0 is the palm's."""
-        self.table.write(name, value, row)
+    def put(self, name: Field, value: Lanes, body: Any) -> None:
+        """Stores a field of a body; 0 is the palm."""
+        self.table.write(name, value, body)
 
-    def wrench_on(self, row: Any) -> Lanes:
+    def wrench_on(self, body: Any) -> Lanes:
         """Wrench of all contacts on a body, (6, ...)."""
-        return self.table.read(Side.wrench, row)
+        return self.table.read(Side.wrench, body)
 
     def clear(self) -> None:
         """Takes all contacts from the bodies."""
 
-        def clear(row: Any, x: jax.Array) -> jax.Array:
+        def clear(body: Any, x: jax.Array) -> jax.Array:
             if self.parts is None:
-                self.put(Side.wrench, zeros((6,), self.like), row)
+                self.put(Side.wrench, zeros((6,), self.like), body)
             else:
-                self.parts.put(Side.wrench, self.like, row)
+                self.parts.put(Side.wrench, self.like, body)
             return x
 
         jax.lax.fori_loop(0, self.bodies, clear, jnp.int32(0))
@@ -148,32 +148,32 @@ class Sides:
 
             return lanewise(moved, place, contacts.cone_at(item), link_acc)
 
-        mine = of_side(Slot.row)
+        mine = of_side(Slot.side)
         if pairing.itself is None:
             return lanewise(jnp.subtract, mine, pairing.swap(mine))
-        ways = (lambda: of_side(Slot.other)), (lambda: pairing.swap(mine))
+        ways = (lambda: of_side(Slot.other_side)), (lambda: pairing.swap(mine))
         theirs = either(anywhere(pairing.itself), *ways, self.block.size)
         return lanewise(jnp.subtract, mine, theirs)
 
     def _accelerations(self, contacts: ContactList, item: Item, field: Field) -> Lanes:
         """Accelerations of the bodies in a field of a slot; zeros where nothing touches."""
         if self.gathers:
-            row = contacts.read(field, item).lane.astype(jnp.int32)
-            return self.table.gather(Side.link_acc, row, self.block.column)
+            body = contacts.read(field, item).lane.astype(jnp.int32)
+            return self.table.gather(Side.link_acc, body, self.block.column)
 
-        def take(row: Any, chosen: jax.Array, accs: Lanes) -> Lanes:
-            new = self.table.read(Side.link_acc, row)
+        def take(body: Any, chosen: jax.Array, accs: Lanes) -> Lanes:
+            new = self.table.read(Side.link_acc, body)
             return lanewise(jnp.where, lanes([chosen], (), wide=True), new, accs)
 
-        return self._each_row(contacts, item, field, take, zeros((6,), self.like))
+        return self._each_body(contacts, item, field, take, zeros((6,), self.like))
 
     def own_side(self, contacts: ContactList, item: Item) -> OwnSide:
         """Reads a slot's own side, for `load`; before anything of the slot is stored."""
         if not self.gathers or self.parts is not None:
             return OwnSide(contacts.place(item), None, None)
-        row = contacts.read(Slot.row, item).lane.astype(jnp.int32)
-        wrench = self.table.gather(Side.wrench, row, self.block.column)
-        return OwnSide(contacts.place(item), row, wrench)
+        body = contacts.read(Slot.side, item).lane.astype(jnp.int32)
+        wrench = self.table.gather(Side.wrench, body, self.block.column)
+        return OwnSide(contacts.place(item), body, wrench)
 
     def load(self, contacts: ContactList, item: Item, side: OwnSide, force: Lanes) -> None:
         """Adds a slot's force to its own side's wrench, and takes it from the other side's."""
@@ -182,11 +182,11 @@ class Sides:
         if self.parts is not None:
             contacts.write(TeamSlot.wrench, more, item)
             return
-        self._add_wrench(contacts, item, Slot.row, more, side)
+        self._add_wrench(contacts, item, Slot.side, more, side)
         if pairing.itself is not None:
 
             def opposite() -> None:
-                self._add_wrench(contacts, item, Slot.other, lanewise(jnp.negative, more))
+                self._add_wrench(contacts, item, Slot.other_side, lanewise(jnp.negative, more))
 
             any_of(pairing.itself, opposite)
 
@@ -198,22 +198,27 @@ class Sides:
         more: Lanes,
         side: OwnSide | None = None,
     ) -> None:
+        """Adds a wrench (6, ...) to that of the bodies in a field of a slot.
+
+        Args:
+          side: What is known of the own side, if it is that.
+        """
         if self.gathers:
-            if side is None or side.row is None or side.wrench is None:
-                row = contacts.read(field, item).lane.astype(jnp.int32)
-                sums = self.table.gather(Side.wrench, row, self.block.column)
+            if side is None or side.body is None or side.wrench is None:
+                body = contacts.read(field, item).lane.astype(jnp.int32)
+                sums = self.table.gather(Side.wrench, body, self.block.column)
             else:
-                row, sums = side.row, side.wrench
+                body, sums = side.body, side.wrench
             sums = lanewise(jnp.add, sums, more)
-            self.table.scatter(Side.wrench, sums, row, self.block.column)
+            self.table.scatter(Side.wrench, sums, body, self.block.column)
             return
 
-        def add(row: Any, chosen: jax.Array, nothing: list) -> list:
+        def add(body: Any, chosen: jax.Array, nothing: list) -> list:
             mask = lanes([chosen], (), wide=True)
-            self.put(Side.wrench, lanewise(_add_where, mask, self.wrench_on(row), more), row)
+            self.put(Side.wrench, lanewise(_add_where, mask, self.wrench_on(body), more), body)
             return nothing
 
-        self._each_row(contacts, item, field, add, [])
+        self._each_body(contacts, item, field, add, [])
 
     def _add_up(self, contacts: ContactList, parts: TeamRows) -> None:
         """Adds a team's slots to their sides one after the other, a lane each component."""
@@ -228,9 +233,9 @@ class Sides:
                 slot = layout.slots.slot(cells, row, k)
                 # Lanes without a component read what nobody wrote, which may be no number.
                 more = jnp.where(self.block.mate < 6, parts.get(name, slot.source), 0.0)
-                pushes = {Slot.row: more}
+                pushes = {Slot.side: more}
                 if layout.with_itself:
-                    pushes[Slot.other] = jnp.where(jnp.equal(row, 0), -more, 0.0)
+                    pushes[Slot.other_side] = jnp.where(jnp.equal(row, 0), -more, 0.0)
                 for field, push in pushes.items():
                     side = contacts.read(field, slot).lane.astype(jnp.int32)
                     parts.put(Side.wrench, parts.get(Side.wrench, side) + push, side)
@@ -240,50 +245,50 @@ class Sides:
 
         jax.lax.fori_loop(0, layout.slots.rows, of_row, jnp.int32(0))
 
-    # Rows of a slot's lanes, where lanes do not gather
+    # Bodies of a slot's lanes, where lanes do not gather
 
-    def list_rows(self, contacts: ContactList) -> None:
-        """Lists the different rows of each slot's lanes, when all contacts are found."""
+    def list_bodies(self, contacts: ContactList) -> None:
+        """Lists the different bodies of each slot's lanes, when all contacts are found."""
         if self.gathers:
             return
 
         def store(item: Item) -> None:
-            self._list_rows(contacts, item, Slot.row)
+            self._list_bodies(contacts, item, Slot.side)
             itself = item.pairing.itself
             if itself is not None:
-                any_of(itself, lambda: self._list_rows(contacts, item, Slot.other))
+                any_of(itself, lambda: self._list_bodies(contacts, item, Slot.other_side))
 
         contacts.each(store)
 
-    def _list_rows(self, contacts: ContactList, item: Item, field: Field) -> None:
-        """Lists the different rows at which a slot's lanes touch.
+    def _list_bodies(self, contacts: ContactList, item: Item, field: Field) -> None:
+        """Lists the different bodies at which a slot's lanes touch.
 
-        The k-th row is stored on the k-th lane of the field's list, their number on all lanes.
+        The k-th body is stored on the k-th lane of the field's list, their number on all lanes.
         """
         nothing = jnp.full_like(self.like, -1.0)
 
         def step(carry: list) -> list:
-            count, row, left, listed = carry
-            left = jnp.where(left == row, -1, left)
-            listed = jnp.where(self.block.lane == count, row.astype(listed.dtype), listed)
+            count, body, left, listed = carry
+            left = jnp.where(left == body, -1, left)
+            listed = jnp.where(self.block.lane == count, body.astype(listed.dtype), listed)
             return [count + 1, jnp.max(left), left, listed]
 
-        left = _touched_rows(contacts, item, field)
+        left = _touched_bodies(contacts, item, field)
         first = [jnp.int32(0), jnp.max(left), left, nothing]
         count, _, _, listed = jax.lax.while_loop(lambda c: c[1] >= 0, step, first)
         counts = self.like + count.astype(self.like.dtype)
         contacts.write(f"{field}_listed", lanes([listed], (1, 1), wide=True), item)
         contacts.write(f"{field}_count", lanes([counts], (1, 1), wide=True), item)
 
-    def _each_row(
-        self, contacts: ContactList, item: Item, field: Field, body: Callable, start: Any
+    def _each_body(
+        self, contacts: ContactList, item: Item, field: Field, act: Callable, start: Any
     ) -> Any:
-        """Folds body(row, lanes that touch there, tree of lanes) over the rows of a slot's lanes.
+        """Folds act(body, lanes that touch there, tree of lanes) over the bodies of a slot's lanes.
 
         Few lanes of a block touch in one slot, at two rows if it is one contact: on CPUs whose
         vectors gather number by number that is faster than to gather.
         """
-        rows = _touched_rows(contacts, item, field)
+        bodies = _touched_bodies(contacts, item, field)
         arrays, rebuild = solid(start, self.block.size)
         name = f"{contacts.layout.name}.{field}"
         slot = item.source
@@ -291,16 +296,16 @@ class Sides:
 
         def step(carry: list) -> list:
             k, *values = carry
-            row = self.table.number(f"{name}_listed", slot, k).astype(jnp.int32)
-            new = solid(body(row, rows == row, rebuild(values)), self.block.size)[0]
+            body = self.table.number(f"{name}_listed", slot, k).astype(jnp.int32)
+            new = solid(act(body, bodies == body, rebuild(values)), self.block.size)[0]
             return [k + 1, *new]
 
         first = [jnp.int32(0), *arrays]
         return rebuild(jax.lax.while_loop(lambda c: c[0] < count, step, first)[1:])
 
 
-def _touched_rows(contacts: ContactList, item: Item, field: Field) -> jax.Array:
-    """Row of each lane's side of a slot, int32, shape (lane,); -1 where nothing touches."""
+def _touched_bodies(contacts: ContactList, item: Item, field: Field) -> jax.Array:
+    """Body of each lane's side of a slot, int32, shape (lane,); -1 where nothing touches."""
     touches = contacts.read(Contact.share, item).lane > 0
     return jnp.where(touches, contacts.read(field, item).lane.astype(jnp.int32), -1)
 

@@ -176,7 +176,7 @@ class StepMemory:
             return
         self.self_contacts = self.self_contacts.counted()
         self.contacts[self.self_contacts.layout.name] = self.self_contacts
-        self.sides.list_rows(self.self_contacts)
+        self.sides.list_bodies(self.self_contacts)
 
     def _table(self, name: str) -> BoundTable:
         tables = self.hand, self.finger_state, self.scratch, self.onchip

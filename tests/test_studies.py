@@ -231,19 +231,56 @@ def test_the_middle_of_distributions_is_theirs_without_a_width():
 
 def test_searches_at_two_accuracies_are_compared_by_seed():
     """Pairs that all differ by two points have an interval without width; other rows are left."""
+    default = {"optimizer": "screened-es", "hand": None}
 
     def row(kept, *changes):
-        return {"hand": None, "kept": [kept], "grasps": [60], "changes": [*changes, "--first=7"]}
+        return default | {"kept": [kept], "grasps": [60], "changes": [*changes, "--first=7"]}
 
     plain = row([0.94, 0.96, 0.90], "--judged=reference")
     coarse = row([0.96, 0.98, 0.92], "--searched=fast", "--judged=reference")
-    again = {"hand": None, "changes": coarse["changes"]}
+    again = default | {"changes": coarse["changes"]}
     again["retest"] = {"finalists": 9, "lost": 1, "chosen_otherwise": 2}
-    text = search_tables.accuracies_table([coarse, again, plain, row([0.1, 0.2, 0.3])])
+    other = coarse | {"optimizer": "random", "kept": [[0.5]]}
+    rows = [coarse, again, plain, other, row([0.1, 0.2, 0.3])]
+    text = search_tables.accuracies_table(rows)
     first, second = (line.split(" | ") for line in text.splitlines()[2:])
     assert first[1] == "`standard`" and first[4:6] == ["93.3", "0.33 (0.06 to 0.79)"]
     assert second[1] == "`fast`" and second[6:] == ["+2.0 (+2.0 to +2.0)", "1 of 9", "2 |"]
     assert search_tables.accuracies_table([row([0.1])]) == ""
+
+
+def test_a_search_stands_in_the_table_of_what_it_shares_with_others():
+    """Accuracies and time are no changes of what is searched; what all rows share is left out."""
+
+    def row(optimizer, *changes, **files):
+        made = {"optimizer": optimizer, "changes": [*changes], "kept": [[1.0, 0.5]]}
+        made |= {"preset": "23d", "scene": "paper", "grasps": [60]}
+        return made | {"provenance": {"commit": "abcdef0123"}} | files
+
+    coarse = ("--searched=fast", "--first=7")
+    judged = row("screened-es", *coarse, "--judged=reference")
+    timed = [row("turbo:trials=3", "equal time"), row("screened-es", *coarse), judged]
+    hands = [
+        row("screened-es", *coarse, objects="household"),
+        row("screened-es", *coarse, scene="build"),
+    ]
+    grasps = [row("random"), row("screened-es")]
+    left = [row("screened-es", "--judged=reference"), row("screened-es", "hand.x=1", *coarse)]
+    texts = search_tables.tables([*timed, *hands, *grasps, *left])
+    shown = {mark: [line[2:].split(" | ") for line in t.splitlines()] for mark, t in texts.items()}
+    found = ["2", "60", "0.750", "0.525", "0.50 (0.09 to 0.91)", "abcdef0 |"]
+    assert shown["equal-time"][0][:4] == ["optimiser", "episodes at", "judged at", "seeds"]
+    assert shown["equal-time"][2:] == [
+        ["`screened-es`", "`fast`", "`reference`", *found],
+        ["`screened-es`", "`fast`", "`standard`", *found],
+        ["`turbo:trials=3`", "`standard`", "`standard`", *found],
+    ]
+    assert shown["other-hands"][2:] == [
+        ["`build4`", "three", *found],
+        ["`pneuflex4`", "household", *found],
+    ]
+    assert shown["equal-grasps"][2:] == [["`screened-es`", *found], ["`random`", *found]]
+    assert texts.keys() == {"equal-time", "other-hands", "equal-grasps"}
 
 
 def test_a_page_of_rates_has_the_last_file_of_each_platform():
@@ -468,6 +505,14 @@ def test_a_gpu_leaves_out_what_cpus_alone_simulate(monkeypatch, capsys):
     assert [f"{name}: only with JAX_PLATFORMS=cpu" for name in alone] == (
         capsys.readouterr().out.splitlines()
     )
+
+
+def test_the_page_on_searches_has_the_tables_of_its_data():
+    rows = [json.loads(p.read_text()) for p in (EXPERIMENTS.parent / "search").glob("*.json")]
+    page = (EXPERIMENTS.parents[1] / "notes/search.md").read_text()
+    for mark, text in search_tables.tables(rows).items():
+        shown = page.split(f"<!-- {mark}:begin -->")[1].split(f"<!-- {mark}:end -->")[0]
+        assert {*shown.strip().splitlines()} == {*text.splitlines()}, mark
 
 
 def test_the_page_has_the_tables_of_its_data(monkeypatch):

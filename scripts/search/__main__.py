@@ -34,7 +34,7 @@ from codesign_jax.judge.verdict import WANTED
 from codesign_jax.runs.progress import duration
 from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import design_space
-from scripts.search.tables import LIMITED, accuracies_table, lines_table, masses_table, table
+from scripts.search.tables import LIMITED, accuracies_table, lines_table, tables
 from scripts.shared import output, provenance, work
 from scripts.shared.lock_step import Study, make_case
 
@@ -154,14 +154,12 @@ def main(arguments: list[str] | None = None) -> int:
         rows = [json.loads(path.read_text()) for path in sorted(args.report.glob("*.json"))]
         if not rows:
             sys.exit(f"error: {args.report} has no results of scripts.search")
-        plain = [row for row in rows if "kept" in row and not row.get("changes")]
-        output.fill(args.page, table(plain), "search")
+        for mark, text in tables(rows).items():
+            output.fill(args.page, text, mark)
         if text := lines_table(rows):
             output.fill(LINES_PAGE, text, "valves")
         if text := accuracies_table(rows):
             output.fill(ACCURACY_PAGE, text, "search")
-        if any("masses" in row for row in rows):
-            output.fill(args.page, masses_table(rows), "masses")
         return 0
     use_compilation_cache()
     try:

@@ -8,6 +8,7 @@ import numpy as np
 from codesign_jax import scene
 from codesign_jax.judge.verdict import WANTED
 from codesign_jax.optimize import DEFAULT, NAMES
+from codesign_jax.runs.settings import COARSE
 from codesign_jax.statistics import wilson
 from scripts.shared import output, statistics
 
@@ -18,16 +19,22 @@ TABLE = "paper-23d"
 SEARCHED = "--searched="
 JUDGED = "--judged="
 """Options of a search with accuracies of its own for the episodes and for the judging trials."""
+EQUAL_TIME = "equal time"
+"""Change of a search that has the default search's time, not its grasps."""
+ALIKE = (SEARCHED, JUDGED, "--first=", EQUAL_TIME)
+"""Beginnings of changes that leave scene and hand as they are."""
 LINES = "hand.valves.lines="
 """Change of a search in which fingers share pressure lines."""
 
 
 def order(row: dict[str, Any]) -> tuple:
-    """Where a row stands: 23D first, the paper's objects first, the default's order of names."""
+    """Where a row stands: 23D, the paper's objects, the default and `reference` first."""
     name = row["optimizer"].split(":")[0]
     place = NAMES.index(name) if name in NAMES else len(NAMES)
     few = row["preset"] not in (LIMITED, TABLE)
-    return few, row["preset"] != LIMITED, row.get("objects") or "", place, row["optimizer"]
+    judged = not _option(row, JUDGED)
+    objects = row.get("objects") or ""
+    return few, row["preset"] != LIMITED, objects, place, judged, row["optimizer"]
 
 
 def hand_of(row: dict[str, Any]) -> str:
@@ -40,29 +47,50 @@ def _hand_of_scene(name: str) -> str:
     return scene.load(name).hand.name
 
 
+def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """Tables of the page on searches, by their marks; a table without rows is left out."""
+    alike = [row for row in rows if "kept" in row and not _changed(row)]
+    timed = [r for r in alike if EQUAL_TIME in r["changes"] or _option(r, SEARCHED) == COARSE]
+    groups = {
+        "equal-time": [row for row in timed if _is_usual(row)],
+        "other-hands": [row for row in timed if not _is_usual(row)],
+        "equal-grasps": [row for row in alike if not row["changes"]],
+    }
+    texts = {mark: table(group) for mark, group in groups.items() if group}
+    if any("masses" in row for row in rows):
+        texts["masses"] = masses_table(rows)
+    return texts
+
+
 def table(rows: list[dict[str, Any]]) -> str:
-    """A row for each optimiser: what its recommended designs keep at its last mark."""
-    head = "optimiser|preset|hand|objects|seeds|grasps of a seed|median kept|"
-    head += "kept share, 5th percentile of the seeds|"
-    head += "share of seeds that keep 95 % (95 % interval)|commit"
-    table_rows = [head.split("|")]
+    """A row for each search: what its recommended designs keep at its last mark.
+
+    What all searches have in common is left out, and is for the page to say.
+    """
+    table_rows = []
     for row in sorted(rows, key=order):
         kept = np.array(row["kept"][-1])
-        table_rows.append(
-            [
-                f"`{row['optimizer']}`",
-                row["preset"],
-                hand_of(row),
-                row.get("objects") or "three",
-                str(kept.size),
-                f"{row['grasps'][-1]:,}",
-                f"{np.median(kept):.3f}",
-                f"{np.quantile(kept, 0.05):.3f}",
-                share_of(kept),
-                row["provenance"]["commit"][:7],
-            ]
-        )
-    return output.markdown(table_rows)
+        searched = {
+            "optimiser": f"`{row['optimizer']}`",
+            "preset": row["preset"],
+            "hand": f"`{hand_of(row)}`",
+            "objects": row.get("objects") or "three",
+            "episodes at": f"`{_option(row, SEARCHED) or 'standard'}`",
+            "judged at": f"`{_option(row, JUDGED) or 'standard'}`",
+        }
+        found = {
+            "seeds": str(kept.size),
+            "grasps of a seed": f"{row['grasps'][-1]:,}",
+            "median kept": f"{np.median(kept):.3f}",
+            "kept share, 5th percentile of the seeds": f"{np.quantile(kept, 0.05):.3f}",
+            "share of seeds that keep 95 % (95 % interval)": share_of(kept),
+            "commit": row["provenance"]["commit"][:7],
+        }
+        table_rows.append((searched, found))
+    named = [name for name in table_rows[0][0] if len({s[name] for s, _ in table_rows}) > 1]
+    head = [*named, *table_rows[0][1]]
+    cells = [[*(s[name] for name in named), *f.values()] for s, f in table_rows]
+    return output.markdown([head, *cells])
 
 
 def masses_table(rows: list[dict[str, Any]]) -> str:
@@ -72,7 +100,7 @@ def masses_table(rows: list[dict[str, Any]]) -> str:
         head = ["preset", "hand", "searched with"]
         objects = row.get("objects") or "objects as they are"
         cells = [row["preset"], hand_of(row)]
-        cells.append(" ".join(row["changes"]) or objects)
+        cells.append(" ".join(_changed(row)) or objects)
         for mass, kept in row["masses"].items():
             head += [f"{1e3 * float(mass):g} g: kept on average", "seeds that keep 95 %"]
             cells += [f"{np.mean(kept):.3f}", share_of(np.array(kept))]
@@ -109,14 +137,15 @@ def lines_table(rows: list[dict[str, Any]]) -> str:
 
 
 def accuracies_table(rows: list[dict[str, Any]]) -> str:
-    """Searches whose designs were judged at another accuracy than the scene's, hand by hand.
+    """Default searches whose designs were judged at another accuracy than the scene's, by hand.
 
     The differences are paired by seed: from the first search of the hand, the one that has one
     accuracy for all of its grasps.  A bootstrap over seeds is also one over the judging trials,
     which each seed has for itself.  The last two columns are those of `--retest`.  Empty without
     such a search.
     """
-    judged = [r for r in rows if "kept" in r and _option(r, JUDGED)]
+    rows = [row for row in rows if row["optimizer"] == DEFAULT]
+    judged = [row for row in rows if "kept" in row and _option(row, JUDGED)]
     retests = {(hand_of(r), *r["changes"]): r["retest"] for r in rows if "retest" in r}
     head = ["hand", "accuracy of the episodes", "grasps of a seed", "seeds"]
     head += ["kept on average %", "seeds that keep 95 % (95 % interval)"]
@@ -140,6 +169,16 @@ def accuracies_table(rows: list[dict[str, Any]]) -> str:
             tested = [f"{again['lost']} of {again['finalists']}", str(again["chosen_otherwise"])]
         table_rows.append([*cells, share_of(kept / 100), words, *tested])
     return output.markdown(table_rows) if judged else ""
+
+
+def _is_usual(row: dict[str, Any]) -> bool:
+    """Whether a search is of the paper's scene with its own hand and objects."""
+    return row["scene"] == "paper" and not (row.get("hand") or row.get("objects"))
+
+
+def _changed(row: dict[str, Any]) -> list[str]:
+    """Changes of a search's scene, hand or objects."""
+    return [change for change in row["changes"] if not change.startswith(ALIKE)]
 
 
 def _option(row: dict[str, Any], name: str) -> str:

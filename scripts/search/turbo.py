@@ -34,6 +34,7 @@ from codesign_jax import scene as scenes
 from codesign_jax.engines import make_engine
 from codesign_jax.judge.verdict import WANTED
 from codesign_jax.scene.parameters import design_space
+from scripts.search.tables import EQUAL_TIME
 from scripts.shared import output, provenance
 from scripts.shared.lock_step import Study, make_case
 
@@ -264,7 +265,7 @@ def main() -> int:
     }
     if args.equal_time:
         searches, row["seconds_of_a_seed"] = in_equal_time(make, name, args.seeds, pool, threads)
-        row["changes"] = ["equal time"]
+        row["changes"] = [EQUAL_TIME]
     else:
         search = Searches(make(name, seeds=args.seeds), pool, threads)
         rounds = (args.budget - search.study.tested) // search.study.case.worlds

@@ -33,7 +33,7 @@ PAGES: dict[str, tuple[str, ...]] = {
         "budget.json",
         "free_motion.json",
         "hard_designs.json",
-        "search/*judged*.json",
+        "search/*screened-es*judged*.json",
     ),
     "docs/calibration.md": ("calibration/*.json",),
     "docs/comparison.md": ("rates_*.json",),

@@ -28,7 +28,7 @@ from scripts.accuracy import budget, decisions, report
 from scripts.agree import __main__ as agree
 from scripts.agree import judgement, sides
 from scripts.calibration import OPEN
-from scripts.experiments import fresh, results, simulate
+from scripts.experiments import fresh, join, results, simulate
 from scripts.experiments import report as experiments_report
 from scripts.experiments.simulate import PAPER, TOTAL_GRASPS
 from scripts.search import __main__ as search
@@ -646,6 +646,65 @@ def test_the_results_page_has_the_tables_of_its_data():
     data = ROOT / "docs" / "data" / "experiments"
     text = experiments_report.tables(results.read(data))
     assert text in (ROOT / "docs" / "notes" / "results.md").read_text(encoding="utf-8")
+
+
+def part(study, begin, end):
+    """The runs of a committed experiment from one to before another, as a study of their own."""
+    arrays = {}
+    for name, array in study.data.items():
+        chosen = (slice(begin, end),) if name in join.BY_RUN else (slice(None), slice(begin, end))
+        arrays[name] = array if name in join.COMMON else array[chosen]
+    plan = study.plan | {"runs": end - begin}
+    settings = study.notes["settings"] | {"plan": plan, "seed": begin}
+    share = (end - begin) / study.plan["runs"]
+    notes = study.notes | {"settings": settings, "grasps": share * study.notes["grasps"]}
+    return results.Study(plan, notes, arrays)
+
+
+def test_parts_of_an_experiment_are_joined_to_the_whole():
+    whole = results.load_study(EXPERIMENTS, "2d")
+    assert whole is not None
+    arrays, notes = join.join([part(whole, 0, 12), part(whole, 12, 25), part(whole, 25, 30)])
+    assert arrays.keys() == whole.data.keys()
+    for name, array in whole.data.items():
+        np.testing.assert_array_equal(arrays[name], array, err_msg=name)
+    assert notes["settings"] == whole.notes["settings"]
+    assert notes["grasps"] == whole.notes["grasps"]
+    assert [p["settings"]["seed"] for p in notes["parts"][-2:]] == [12, 25]
+
+
+def test_parts_that_make_no_whole_are_refused():
+    whole = results.load_study(EXPERIMENTS, "2d")
+    assert whole is not None
+    first, second = part(whole, 0, 15), part(whole, 15, 30)
+    for parts in ([second, first], [first, first], [first, part(whole, 16, 30)]):
+        with pytest.raises(ValueError, match="a part begins with seed"):
+            join.join(parts)
+    larger = dataclasses.replace(second, plan=second.plan | {"particles": 60})
+    settings = second.notes["settings"] | {"failure": "worst"}
+    stricter = dataclasses.replace(second, notes=second.notes | {"settings": settings})
+    for other in (larger, stricter):
+        with pytest.raises(ValueError, match="is no part of"):
+            join.join([first, other])
+
+
+def test_fresh_trials_of_parts_are_joined_and_those_of_other_experiments_stay():
+    loaded = results.load(EXPERIMENTS, "fresh")
+    assert loaded is not None
+    whole, notes = loaded
+
+    def runs(begin, end):
+        own = {k: v for k, v in whole.items() if k.startswith("23d|") and k.count("|") == 2}
+        return whole | {k: v[:, begin:end] for k, v in own.items()}, notes
+
+    parts = [runs(0, 20), runs(20, 26), runs(26, 30)]
+    arrays, joined = join.join_fresh("23d", parts)
+    assert arrays.keys() == whole.keys()
+    for name, array in whole.items():
+        np.testing.assert_array_equal(arrays[name], array, err_msg=name)
+    assert joined["runs"] == 3 * notes["runs"]
+    del parts[1][0]["23d|reference|cost"], parts[1][0]["23d|reference|status"]
+    assert not any("23d|reference" in name for name in join.join_fresh("23d", parts)[0])
 
 
 # --- an older version beside this one -------------------------------------------------------------

@@ -76,7 +76,8 @@ def cost_evolution(
     axes.plot([], [], ".", color=_BLUE, label="particle")
     axes.plot(episode, cost.mean(1), color=_ORANGE, lw=2, label="mean of the particles")
     axes.axhline(threshold, color="black", lw=1, ls="--", label="convergence threshold")
-    axes.set(xlabel="episode", ylabel="cost", title=title, xlim=(0, len(cost) + 1))
+    axes.set(xlabel="episode", ylabel="cost", xlim=(0, len(cost) + 1))
+    axes.set_title(title, pad=28)  # above the legend
     axes.set_ylim(bottom=-0.05)
     axes.locator_params(axis="x", integer=True)
     _above(axes)

@@ -1,4 +1,4 @@
-"""Joins parts of an experiment, which have other runs each, and the fresh trials of their winners.
+"""Joins parts of an experiment, each with other runs, and the fresh trials of their winners.
 
 python -m scripts.experiments.join 23d runs/a runs/b --out docs/data/experiments/elements
 
@@ -21,18 +21,28 @@ BY_RUN = ("first", "seeds", "seed_cost", "seed_candidates", "particle_cost")
 """Arrays whose first axis is that of the runs; it is the second one of all others."""
 
 
+def _shared(part: results.Study) -> dict[str, Any]:
+    """What the settings of all parts say: all but their runs and the digest of the scene.
+
+    The digest changes with the version of the package.
+    """
+    own = ("plan", "seed", "scene_sha256")
+    plan = {k: v for k, v in part.plan.items() if k != "runs"}
+    return plan | {k: v for k, v in part.notes["settings"].items() if k not in own}
+
+
 def join(parts: list[results.Study]) -> tuple[simulate.Arrays, dict[str, Any]]:
     """Arrays and notes of the whole experiment.
 
     Raises:
-      ValueError: If the parts differ in more than their runs, or these do not follow one another.
+      ValueError: If the parts differ in more than their runs and versions, or their seeds do not
+        follow one another.
     """
     notes = parts[0].notes | {"grasps": sum(p.notes["grasps"] for p in parts)}
-    whole = {k: v for k, v in parts[0].plan.items() if k != "runs"}
     seed = parts[0].notes["settings"]["seed"]
     for part in parts:
-        if {k: v for k, v in part.plan.items() if k != "runs"} != whole:
-            raise ValueError(f"{part.plan} is no part of {whole}")
+        if _shared(part) != _shared(parts[0]):
+            raise ValueError(f"{_shared(part)} is no part of {_shared(parts[0])}")
         if part.notes["settings"]["seed"] != seed:
             raise ValueError(
                 f"a part begins with seed {part.notes['settings']['seed']}, not {seed}"

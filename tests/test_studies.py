@@ -694,8 +694,8 @@ def test_fresh_trials_of_parts_are_joined_and_those_of_other_experiments_stay():
     whole, notes = loaded
 
     def runs(begin, end):
-        own = {k: v for k, v in whole.items() if k.startswith("23d|") and k.count("|") == 2}
-        return whole | {k: v[:, begin:end] for k, v in own.items()}, notes
+        cut = {k: v for k, v in whole.items() if k.startswith("23d|") and k.count("|") == 2}
+        return whole | {k: v[:, begin:end] for k, v in cut.items()}, notes
 
     parts = [runs(0, 20), runs(20, 26), runs(26, 30)]
     arrays, joined = join.join_fresh("23d", parts)

@@ -26,9 +26,9 @@ def _shared(part: results.Study) -> dict[str, Any]:
 
     The digest changes with the version of the package.
     """
-    own = ("plan", "seed", "scene_sha256")
+    differ = ("plan", "seed", "scene_sha256")
     plan = {k: v for k, v in part.plan.items() if k != "runs"}
-    return plan | {k: v for k, v in part.notes["settings"].items() if k not in own}
+    return plan | {k: v for k, v in part.notes["settings"].items() if k not in differ}
 
 
 def join(parts: list[results.Study]) -> tuple[simulate.Arrays, dict[str, Any]]:

@@ -38,7 +38,7 @@ def join(parts: list[results.Study]) -> tuple[simulate.Arrays, dict[str, Any]]:
       ValueError: If the parts differ in more than their runs and versions, or their seeds do not
         follow one another.
     """
-    notes = parts[0].notes | {"grasps": sum(p.notes["grasps"] for p in parts)}
+    notes: dict[str, Any] = parts[0].notes | {"grasps": sum(p.notes["grasps"] for p in parts)}
     seed = parts[0].notes["settings"]["seed"]
     for part in parts:
         if _shared(part) != _shared(parts[0]):
@@ -79,7 +79,8 @@ def join_fresh(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("experiment", choices=["2d", "23d"])
     parser.add_argument("parts", type=Path, nargs="+", help="folders, in the order of their seeds")
     parser.add_argument("--out", type=Path, required=True, help="folder")

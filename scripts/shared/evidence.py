@@ -28,7 +28,7 @@ FIRST_VERSION = "0.1.0"
 EVERY = ("**/*.json",)
 """The data of pages that quote several studies, or none by a file: old while any figure is."""
 PAGES: dict[str, tuple[str, ...]] = {
-    "README.md": EVERY,
+    "README.md": ("budget.json", "hard_designs.json", "rates_*.json", "search/*searched*.json"),
     "docs/accuracy.md": (
         "budget.json",
         "free_motion.json",
@@ -175,8 +175,10 @@ def mark(measured: set[tuple[str, str]], present: tuple[str, str]) -> str:
     versions = sorted({made[0] for made in measured if developed or made != present})
     if not versions:
         return ""
-    named = " and ".join(versions)
-    return f"*The figures of this page were measured with version {named}; this version differs.*"
+    *others, last = versions
+    named = f"versions {', '.join(others)} and {last}" if others else f"version {last}"
+    figures = "The figures" if developed or present not in measured else "Some figures"
+    return f"*{figures} of this page were measured with {named}; this version differs.*"
 
 
 def marked(text: str, sentence: str) -> str:

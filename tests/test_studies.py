@@ -268,18 +268,18 @@ def test_a_search_stands_in_the_table_of_what_it_shares_with_others():
     left = [row("screened-es", "--judged=reference"), row("screened-es", "hand.x=1", *coarse)]
     texts = search_tables.tables([*timed, *hands, *grasps, *left])
     shown = {mark: [line[2:].split(" | ") for line in t.splitlines()] for mark, t in texts.items()}
-    found = ["2", "60", "0.750", "0.525", "0.50 (0.09 to 0.91)", "abcdef0 |"]
+    outcome = ["2", "60", "0.750", "0.525", "0.50 (0.09 to 0.91)", "abcdef0 |"]
     assert shown["equal-time"][0][:4] == ["optimiser", "episodes at", "judged at", "seeds"]
     assert shown["equal-time"][2:] == [
-        ["`screened-es`", "`fast`", "`reference`", *found],
-        ["`screened-es`", "`fast`", "`standard`", *found],
-        ["`turbo:trials=3`", "`standard`", "`standard`", *found],
+        ["`screened-es`", "`fast`", "`reference`", *outcome],
+        ["`screened-es`", "`fast`", "`standard`", *outcome],
+        ["`turbo:trials=3`", "`standard`", "`standard`", *outcome],
     ]
     assert shown["other-hands"][2:] == [
-        ["`build4`", "three", *found],
-        ["`pneuflex4`", "household", *found],
+        ["`build4`", "three", *outcome],
+        ["`pneuflex4`", "household", *outcome],
     ]
-    assert shown["equal-grasps"][2:] == [["`screened-es`", *found], ["`random`", *found]]
+    assert shown["equal-grasps"][2:] == [["`screened-es`", *outcome], ["`random`", *found]]
     assert texts.keys() == {"equal-time", "other-hands", "equal-grasps"}
 
 

@@ -78,7 +78,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             "episodes at": f"`{_option(row, SEARCHED) or 'standard'}`",
             "judged at": f"`{_option(row, JUDGED) or 'standard'}`",
         }
-        found = {
+        outcome = {
             "seeds": str(kept.size),
             "grasps of a seed": f"{row['grasps'][-1]:,}",
             "median kept": f"{np.median(kept):.3f}",
@@ -86,7 +86,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             "share of seeds that keep 95 % (95 % interval)": share_of(kept),
             "commit": row["provenance"]["commit"][:7],
         }
-        table_rows.append((searched, found))
+        table_rows.append((searched, outcome))
     named = [name for name in table_rows[0][0] if len({s[name] for s, _ in table_rows}) > 1]
     head = [*named, *table_rows[0][1]]
     cells = [[*(s[name] for name in named), *f.values()] for s, f in table_rows]

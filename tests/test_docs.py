@@ -219,20 +219,20 @@ def test_figures_of_another_version_are_marked(page):
 
 
 MADE = {
-    "the present one": ("0.2.0", {("0.2.0", "k")}, ""),
-    "an older version": ("0.2.0", {("0.1.0", "k"), ("0.2.0", "k")}, "0.1.0"),
-    "another kernel": ("0.2.0", {("0.2.0", "old"), ("0.2.0", "k")}, "0.2.0"),
-    "a development version": ("0.3.0.dev0", {("0.3.0.dev0", "k")}, "0.3.0.dev0"),
-    "two versions": ("0.3.0", {("0.1.0", "a"), ("0.2.0", "b")}, "0.1.0 and 0.2.0"),
+    "the present one": ("0.2.0", {("0.2.0", "k")}, "", ""),
+    "an older version": ("0.2.0", {("0.1.0", "k"), ("0.2.0", "k")}, "Some", "version 0.1.0"),
+    "another kernel": ("0.2.0", {("0.2.0", "old"), ("0.2.0", "k")}, "Some", "version 0.2.0"),
+    "a development version": ("0.3.0.dev0", {("0.3.0.dev0", "k")}, "The", "version 0.3.0.dev0"),
+    "two versions": ("0.3.0", {("0.1.0", "a"), ("0.2.0", "b")}, "The", "versions 0.1.0 and 0.2.0"),
 }
 
 
 @pytest.mark.parametrize("case", MADE)
 def test_a_mark_names_the_versions_of_older_figures(case):
-    version, measured, named = MADE[case]
+    version, measured, share, named = MADE[case]
     page = "# Title\n\nText.\n"
     text = evidence.marked(page, evidence.mark(measured, (version, "k")))
-    assert (f"version {named}; this" in text) if named else text == page
+    assert (f"with {named}; this" in text and f"*{share} figures" in text) if named else text == page
     assert evidence.marked(text, evidence.mark(measured, (version, "k"))) == text
     assert evidence.marked(text, "") == page
 

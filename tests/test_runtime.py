@@ -346,6 +346,8 @@ def test_missing_memory_is_an_error(threads):
 def test_a_newer_version_is_refused_by_xla(monkeypatch):
     """Which checks the version that handlers claim; the next kernel runs as before."""
     x, table = kernels.numbers(2)
+    # Asks the headers of XLA's interface, once in a process: later it is XLA that refuses.
+    assert launch.available("cpu") is None
     monkeypatch.setattr(ffi, "MINOR", 99)
     with pytest.raises(launch.KernelUnavailable, match=r"API version \(0\.99\) is incompatible"):
         jax.jit(partial(kernels.run, rounds=3)).lower(x, table)

@@ -8,7 +8,8 @@ A file is the .npz of a search of `scripts.search` (what it recommends in the en
 grasps, --batch at a time.  Depths are those of the rings that the engine presses with, in every
 step from the inflation on.  Beside them stand, as *_surface_mm, depths from recorded poses alone:
 of a body's deepest point from the other's surface, with |y/a|^4 + |z/b|^4 = 1 along a finger's
-blended links and a cap over the last quarter of a segment.
+blended links and a cap over the last quarter of a segment.  Both are of sections under their
+pressure, where they grow with it.
 """
 
 import argparse
@@ -25,7 +26,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from codesign_jax import files, model, rollout, types
+from codesign_jax import files, model, rollout, section_sizes, types
 from codesign_jax import scene as scenes
 from codesign_jax.codesign import SUCCESS_COST
 from codesign_jax.engines import make_engine
@@ -58,8 +59,8 @@ class Tube(NamedTuple):
     """A finger in states.
 
     Centres (state, station, 3) and frames (state, station, 3, 3) of sections with their places
-    along it, a link's length, the cap's half axes, and rings of points (state, ring, point, 3) with
-    their places.
+    along it, a link's length, the cap's half axes (state, 3), and rings of points (state, ring,
+    point, 3) with their places.
     """
 
     centre: np.ndarray
@@ -71,47 +72,60 @@ class Tube(NamedTuple):
     place: np.ndarray
 
 
-def tube(joints: np.ndarray, turn: np.ndarray, size: tuple[float, float, float]) -> Tube:
-    """A finger from joints, frames with that of the half link at the palm first, and its sizes."""
-    links = joints.shape[1]
+def tube(joints: np.ndarray, turn: np.ndarray, size: tuple[float, Any, Any]) -> Tube:
+    """A finger in states.
+
+    Args:
+      joints: Places of its joints [m], shape (state, link, 3).
+      turn: Frames of its links, that of the half link at the palm first.
+      size: Length, and width and height in each state, shape (state,) or () [m].
+    """
+    states, links = joints.shape[:2]
     segment = size[0] / links
-    half = np.array([2 * TIP * size[0] / links, *size[1:]]) / 2
+    half = np.empty((states, 3))
+    for axis, extent in enumerate((2 * TIP * segment, *size[1:])):
+        half[:, axis] = extent / 2
     along = segment * np.arange(STATIONS * links) / STATIONS
     row = np.clip(np.ceil(along / segment - 1e-9).astype(int) - 1, 0, links - 1)
     blend = np.minimum(along / segment - row, 1)[:, None, None]
     mean = turn[:, row] + blend * (turn[:, row + 1] - turn[:, row])  # linear blend skinning
     ahead, across, up = np.moveaxis(mean, -1, 0)
-    centre = joints[:, row] + (along - (row + 0.5) * segment)[:, None] * ahead + half[2] * up
+    beyond = along - (row + 0.5) * segment  # their joints
+    centre = joints[:, row] + beyond[:, None] * ahead + half[:, 2, None, None] * up
     ahead = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
     across = across - (across * ahead).sum(-1, keepdims=True) * ahead
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
     frame = np.stack([ahead, across, np.cross(ahead, across)], -1)
-    body = centre[:, :, None] + (RING * half[1:]) @ frame[..., 1:].swapaxes(-1, -2)
+    outlines = RING * half[:, None, None, 1:]
+    body = centre[:, :, None] + outlines @ frame[..., 1:].swapaxes(-1, -2)
     cap = [np.insert(RING * (1 - u**4) ** 0.25, 0, u, axis=1) for u in CAP]
-    cap = centre[:, -1:, None] + (np.stack(cap) * half) @ frame[:, -1:].swapaxes(-1, -2)
+    cap = np.stack(cap) * half[:, None, None]
+    cap = centre[:, -1:, None] + cap @ frame[:, -1:].swapaxes(-1, -2)
     place = np.append(along, np.full(len(CAP), along[-1]))
     return Tube(centre, frame, along, segment, half, np.concatenate([body, cap], 1), place)
 
 
-def in_tube(rings: np.ndarray, solid: Tube, itself: tuple[np.ndarray, float] | None = None) -> Any:
+def in_tube(
+    rings: np.ndarray, solid: Tube, itself: tuple[np.ndarray, np.ndarray] | None = None
+) -> Any:
     """Depth of the deepest point of each state in a finger [m], 0 where none is, shape (state,).
 
     Args:
       rings: Points around their last one, shape (state, ring, point, 3).
       solid: The finger.
       itself: Of the finger's own rings their places along it, and from which distance on they
-        count.
+        count, shape (state,).
     """
     deepest = np.zeros(len(rings))
     last = len(solid.along) - 1
     if not rings.size:
         return deepest  # a ball has no edges
-    reach = np.linalg.norm(solid.half[1:]) + solid.along[1]
+    reach = np.linalg.norm(solid.half[:, 1:], axis=1).max() + solid.along[1]
     wide = np.linalg.norm(rings - rings[:, :, -1:], axis=-1).max()
     gap = rings[:, :, -1, None].astype(np.float32) - solid.centre[:, None].astype(np.float32)
     near = np.einsum("sijk,sijk->sij", gap, gap) < (reach + wide) ** 2
     if itself is not None:
-        near &= np.abs(itself[0][:, None] - solid.along) > itself[1]
+        near &= np.abs(itself[0][:, None] - solid.along) > itself[1][:, None, None]
     for s in np.flatnonzero(near.any((1, 2))):
         ring, k = np.nonzero(near[s])
         away = rings[s, ring] - solid.centre[s, k][:, None]
@@ -128,25 +142,33 @@ def in_tube(rings: np.ndarray, solid: Tube, itself: tuple[np.ndarray, float] | N
         whole = local[:, 0] - beyond[:, 0]
         inside = (local[:, 0] >= 0) & (tip | (beyond[:, 0] < 0) & (whole > 0))
         share = np.where(inside & ~tip, local[:, 0] / np.where(whole > 0, whole, 1), 0)
-        to_tip = solid.along[-1] + solid.half[0] - solid.along[k] - share * solid.along[1]
+        half = solid.half[s]
+        to_tip = solid.along[-1] + half[0] - solid.along[k] - share * solid.along[1]
         local = local + share[:, None] * (beyond - local)
         local[~tip, 0] = 0
-        inside &= ((local / solid.half) ** 2**2).sum(1) < 1
+        inside &= ((local / half) ** 2**2).sum(1) < 1
         for some, directions in ((inside & ~tip, ACROSS), (inside & tip, AHEAD)):
             if some.any():  # the nearest tangent of a convex section
-                support = ((directions * solid.half) ** (4 / 3)).sum(1) ** 0.75
+                support = ((directions * half) ** (4 / 3)).sum(1) ** 0.75
                 depth = (support - np.abs(local[some]) @ directions.T).min(1)
                 depth = np.where(tip[some], depth, np.minimum(depth, to_tip[some]))
                 deepest[s] = max(deepest[s], depth.max())
     return deepest
 
 
-def in_disc(palm: Any, place: np.ndarray, turn: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Depth of the deepest point (state, ring, point, 3) in the palm's disc from below or aside."""
-    points = points.reshape(len(place), -1, 3) - place[:, None]
-    x, y, z = np.moveaxis(points @ turn, -1, 0)
-    inside = np.minimum(palm.radius - np.hypot(x, y), z)
-    return np.where(z < palm.thickness, np.maximum(inside, 0), 0).max(1)
+def in_disc(
+    palm: Any, place: np.ndarray, turn: np.ndarray, points: np.ndarray, counts: Any = True
+) -> np.ndarray:
+    """Depth of the deepest point in the palm's disc from below or aside, shape (state,).
+
+    Args:
+      points: Points, shape (state, ring, point, 3).
+      counts: Which rings count, shape (state, ring); all without.
+    """
+    away = points - place[:, None, None]
+    x, y, z = np.moveaxis(away @ turn[:, None], -1, 0)
+    inside = np.minimum(palm.radius - np.hypot(x, y), z).max(2, initial=0, where=z < palm.thickness)
+    return inside.max(1, initial=0, where=counts)
 
 
 def in_object(kind: str, size: np.ndarray, local: np.ndarray) -> np.ndarray:
@@ -205,16 +227,16 @@ def surface_depths(
         depths[name] = np.maximum(depths[name], depth)
 
     for f, finger_tube in enumerate(tubes):
-        least = max(ARC[0] * finger_tube.segment, ARC[1] * 2 * finger_tube.half[2])
+        height = 2 * finger_tube.half[:, 2]
+        least = np.maximum(ARC[0] * finger_tube.segment, ARC[1] * height)
         deeper("self", in_tube(finger_tube.rings, finger_tube, (finger_tube.place, least)))
         for other in tubes[:f] + tubes[f + 1 :]:
             depth = in_tube(finger_tube.rings, other)
             deeper("finger", depth)
-            deeper("share", depth / (2 * other.half[1:].min()))
+            deeper("share", depth / (2 * other.half[:, 1:].min(1)))
         free = finger_tube.place > PALM_FROM * lay.links * finger_tube.segment
-        free &= beyond_base(finger_tube.place, 2 * finger_tube.half[2])
-        if free.any():
-            deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], finger_tube.rings[:, free]))
+        free = free & beyond_base(finger_tube.place, height[:, None])
+        deeper("palm", in_disc(palm, place[:, 1], turn[:, 1], finger_tube.rings, free))
         points = finger_tube.rings.reshape(len(place), -1, 3) - centre[:, None]
         deeper("object", in_object(kind, size, points @ frame))
         deeper("object", in_tube(edges[:, :, None], finger_tube))
@@ -224,9 +246,10 @@ def surface_depths(
 def measure(
     scene: Scene, params: Any, trial: Any, qpos: np.ndarray, recorded: dict[str, np.ndarray]
 ) -> dict[str, float]:
-    """Depths [mm], durations [s], and bending while held, of a grasp in states (state, nq).
+    """Depths [mm], durations [s], and bending while held, of a grasp from the inflation on.
 
     Args:
+      qpos: Positions of these states, shape (state, nq).
       recorded: Depths of `types.Forces` in these states [m], by kind of contact, (state,) each.
     """
     h = scene.discretization.timestep
@@ -237,12 +260,19 @@ def measure(
     centre = place[:, lay.object]
     frame = turn[:, lay.object]
     edges, skin = (centre[:, None] + v @ frame.swapaxes(-1, -2) for v in surface(shape, size))
+    first, begin, end = (int(scene.last_step(p)) for p in ("approach", "inflate", "disturb"))
+    grown = section_sizes.of_bodies(scene, params, trial)[first : first + len(qpos)]
     tubes = []
     for f, bodies in enumerate(lay.bodies):
-        sizes = float(params.length[f]), scene.hand.section.width, float(params.height[f])
+        # The half link at the palm has the size of the others here, which no contact meets.
+        width, height = grown[:, bodies[0]].T
+        sizes = (
+            float(params.length[f]),
+            scene.hand.section.width * width,
+            float(params.height[f]) * height,
+        )
         tubes.append(tube(place[:, bodies], turn[:, [lay.stubs[f], *bodies]], sizes))
     surface_series = surface_depths(scene, tubes, place, turn, (shape.type, size, edges))
-    first, begin, end = (int(scene.last_step(p)) for p in ("approach", "inflate", "disturb"))
     hold = slice(begin - first, end - first)
     surface_series["object_palm"] = in_disc(
         scene.hand.palm, place[:, 1], turn[:, 1], skin[:, :, None]

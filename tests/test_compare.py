@@ -795,32 +795,33 @@ def test_conditions_are_numbers_within_the_files_ranges():
 
 
 def placed():
-    """Poses (state, body, 3), all turned alike: fingers a metre apart, links in a row."""
+    """A state: fingers a metre apart, links in a row, all turned alike and without pressure."""
     lay = model.layout(PAPER)
     place = np.zeros((1, len(lay.centre_weights), 3))
     for f, bodies in enumerate(lay.bodies):
         segment = HAND.length[f] / lay.links
         place[0, bodies] = np.c_[segment * np.arange(lay.links), np.full((lay.links, 2), f + 1.0)]
-    return lay, place, np.broadcast_to(np.eye(3), (*place.shape[:2], 3, 3))
+    turn = np.broadcast_to(np.eye(3), (*place.shape[:2], 3, 3))
+    return lay, place, turn, np.ones((*place.shape[:2], 2))
 
 
 def test_overlaps_are_depths_of_sections():
     """A bottom face that is d below another section's top is d deep, in itself and in others."""
-    lay, place, turn = placed()
-    alone = overlap.overlaps(PAPER, HAND, place, turn)
+    lay, place, turn, size = placed()
+    alone = overlap.overlaps(PAPER, HAND, place, turn, size)
     assert not alone.fingers.any() and not alone.palm.any()
     depth = 0.004
     height = float(HAND.height[0])
     place[0, lay.bodies[1]] = place[0, lay.bodies[0]] + [0, 0, height - depth]
-    depths = overlap.overlaps(PAPER, HAND, place, turn).fingers[0]
+    depths = overlap.overlaps(PAPER, HAND, place, turn, size).fingers[0]
     # To first order: the rounded outline is 1 % nearer beside the middle.
     assert depths[1, 0] == pytest.approx(depth, rel=0.02) == depths[0, 1]
     depths[1, 0] = depths[0, 1] = 0
     assert not depths.any()
-    lay, place, turn = placed()
+    lay, place, turn, size = placed()
     place[0, lay.bodies[2][7]] = place[0, lay.bodies[2][1]] + [0, 0, height - depth]
     place[0, lay.bodies[3][5]] = [0, 0, PAPER.hand.palm.thickness - depth]
-    overlaps = overlap.overlaps(PAPER, HAND, place, turn)
+    overlaps = overlap.overlaps(PAPER, HAND, place, turn, size)
     assert overlaps.fingers[0, 2, 2] == pytest.approx(depth, rel=0.02)
     assert overlaps.palm[0] == pytest.approx([0, 0, 0, depth])
     words = stress.of_overlaps(PAPER, HAND, [overlaps])

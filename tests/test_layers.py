@@ -21,7 +21,7 @@ compiler optimize
 scene
 axes model control judge.verdict devices
 engines cost
-preflight policy
+preflight policy section_sizes
 rollout
 user_code measurements
 batch

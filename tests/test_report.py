@@ -117,11 +117,12 @@ def test_the_nearest_triangle_is_that_of_a_ray_s_first_hit():
 def test_an_object_has_its_shadow_where_light_falls_from_it(grasp):
     """The table under the light's ray through the object's middle is darker than around."""
     the_scene, replay = grasp
-    lifted = np.array(replay.qpos[:1])
-    lifted[0, -7:-4] = [0.0, 0.0, 0.1]
-    lifted[0, :3] = [0.3, 0.3, 0.2]  # the hand is aside
+    lifted = np.array(replay.qpos)
+    lifted[:, -7:-4] = [0.0, 0.0, 0.1]
+    lifted[:, :3] = [0.3, 0.3, 0.2]  # the hand is aside
     camera = animation.Camera(azimuth=90.0, elevation=-70.0, distance=0.7, lookat=(0.0, 0.0, 0.0))
-    [picture] = painter.paint(the_scene, replay, lifted, (120, 120), camera)
+    aside = replay._replace(qpos=lifted)
+    [picture] = painter.paint(the_scene, aside, np.zeros(1, int), (120, 120), camera)
     view = painter.View(camera, (120, 120))
     fall = painter.light(camera)
     middle = np.array([0.0, 0.0, 0.1]) - 0.1 / fall[2] * fall
@@ -186,14 +187,14 @@ def test_fingers_move_as_in_mujoco():
     view = mujoco.MjvScene(compiled, maxgeom=100)
     every = int(mujoco.mjtCatBit.mjCAT_ALL)
     camera = mujoco.MjvCamera()
-    for q, pose in zip(grasp.qpos, motion.pose, strict=True):
+    for q, *now in zip(grasp.qpos, motion.pose, motion.size, strict=True):
         data.qpos[:] = q
         mujoco.mj_forward(compiled, data)
         mujoco.mjv_updateScene(compiled, data, mujoco.MjvOption(), None, camera, every, view)
         theirs = np.asarray(view.skinvert).reshape(the_scene.num_fingers, -1, 3)
-        ours = [bodies.vertices(part, pose) for part in shown[: the_scene.num_fingers]]
+        ours = [bodies.vertices(part, *now) for part in shown[: the_scene.num_fingers]]
         np.testing.assert_allclose(ours, theirs, atol=2e-7)  # float32 of both
-        palm = bodies.vertices(shown[-2], pose)
+        palm = bodies.vertices(shown[-2], *now)
         centre = data.geom("palm_disc").xpos
         np.testing.assert_allclose(palm.mean(0), centre, atol=1e-6)
 
@@ -600,9 +601,14 @@ def test_a_browser_without_webgl_shows_a_film_strip(run, flat_browser, tmp_path)
 
 @pytest.mark.browser
 def test_browser_skins_as_python_does(browser, tmp_path):
-    """Vertices on the page at its frames against those of `bodies`, and between them continuous."""
-    the_scene = grasps.pinch("box", links=4, effects__surface="hull")
+    """Vertices on the page at its frames against those of `bodies`, of fingers that grow."""
+    grows = {"effects__surface": "hull", "effects__section_growth": True}
+    the_scene = grasps.pinch("box", links=4, **grows)
     grasp = bent_grasp(the_scene)
+    qpos = np.repeat(grasp.qpos, 4, 0)  # of 10 ms; a frame is 40 ms
+    pressures = np.linspace(0, 80e3, len(qpos))[:, None]
+    ctrl = np.hstack([qpos[:, :6], pressures + np.zeros(the_scene.num_fingers)])
+    grasp = grasp._replace(qpos=qpos, trace=Trace(*np.zeros((4, len(ctrl))), ctrl=ctrl))
     path = viewer.write(
         the_scene, grasp, tmp_path / "r.html", title="<b>", text=["a & b", "x  y\n1  2"]
     )
@@ -612,12 +618,13 @@ def test_browser_skins_as_python_does(browser, tmp_path):
     assert page.locator("h1").inner_text() == "<b>"
     assert page.locator("pre").inner_text() == "x  y\n1  2", "a table's lines"
     motion = bodies.motion(the_scene, grasp)
-    for k, pose in enumerate(motion.pose):
+    assert len(motion.pose) == 3 and motion.size[-1].max() > 1.2
+    for k, now in enumerate(zip(motion.pose, motion.size, strict=True)):
         page.evaluate(f"{view}.seek({k / motion.rate})")
         page.wait_for_timeout(100)
         for part in viewer.shown_parts(the_scene, grasp):
             theirs = page.evaluate(f"{view}.vertices('{part.name}')")
-            ours = bodies.vertices(part, pose)
+            ours = bodies.vertices(part, *now)
             np.testing.assert_allclose(np.reshape(theirs, (-1, 3)), ours, atol=2e-6)  # float32
     page.close()
 

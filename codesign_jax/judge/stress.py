@@ -12,7 +12,7 @@ import jax
 import mujoco
 import numpy as np
 
-from codesign_jax import model, rollout
+from codesign_jax import model, rollout, section_sizes
 from codesign_jax.batch import Batch
 from codesign_jax.engines.mujoco import world_model
 from codesign_jax.interrupts import interruptible
@@ -171,7 +171,7 @@ def simulate(
     wait(RECORDED)
     recorded = Batch(scene, case.make_engine(), rollout.Options(record_qpos=True))
     outcomes, trace, drawn = simulated(recorded, scene)
-    warnings = _in_grasps(scene, params, outcomes, np.asarray(trace.qpos)[:, ::HELD], drawn)
+    warnings = of_grasps(scene, params, outcomes, trace, drawn)
     every = [(AS_IT_IS, outcomes)]
     conditions = Batch(scene, case.make_engine(), rollout.Options())
     every += [(name, simulated(conditions, c)[0]) for name, c in variants(scene)]
@@ -245,9 +245,11 @@ def unknown(scene: Scene) -> draws.Constants:
     return draws.Constants(constant=tuple(constants))
 
 
-def _in_grasps(
-    scene: Scene, params: Params, outcomes: Outcome, qpos: np.ndarray, trials: Trial
+def of_grasps(
+    scene: Scene, params: Params, outcomes: Outcome, trace: Trace, trials: Trial
 ) -> list[str]:
+    """Warnings of what fingers do in kept grasps of a hand, whose trace has positions."""
+    qpos = np.asarray(trace.qpos)[:, ::HELD]
     kept = np.flatnonzero(verdict.kept(outcomes))
     first = [kept[trials.shape[kept] == k][:1] for k in range(len(scene.objects.object))]
     times = np.arange(qpos.shape[1]) * HELD
@@ -262,7 +264,9 @@ def _in_grasps(
     for w in np.concatenate(first).astype(int):
         trial = jax.tree.map(lambda v, w=w: v[w], trials)
         place, turn = _poses(scene, params, trial, qpos[w, hold])
-        depths.append(overlap.overlaps(scene, params, place, turn))
+        ctrl = None if trace.ctrl is None else trace.ctrl[w]
+        size = section_sizes.of_bodies(scene, params, trial, ctrl)[::HELD]
+        depths.append(overlap.overlaps(scene, params, place, turn, size[hold]))
     return [*lines, *of_overlaps(scene, params, depths)]
 
 

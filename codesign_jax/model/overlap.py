@@ -38,12 +38,16 @@ class Overlaps(NamedTuple):
     palm: np.ndarray
 
 
-def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) -> Overlaps:
+def overlaps(
+    scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray, size: np.ndarray
+) -> Overlaps:
     """Overlaps in states of one hand.
 
     Args:
       place: Origins of the bodies' frames [m], shape (state, body, 3).
       turn: Their orientations, shape (state, body, 3, 3).
+      size: Width and height of sections on the bodies over those without pressure, shape
+        (state, body, 2), see `section_sizes.of_bodies`.
     """
     lay = layout(scene)
     disc = scene.hand.palm
@@ -58,38 +62,39 @@ def overlaps(scene: Scene, params: Params, place: np.ndarray, turn: np.ndarray) 
     sizes = []
     beyond = []
     middles = (np.arange(links) + 0.5 + whole / 2) / links
-    size = sections(scene.hand, jax.tree.map(lambda v: np.asarray(v, float), params), middles)
+    section = sections(scene.hand, jax.tree.map(lambda v: np.asarray(v, float), params), middles)
     halves = np.stack(
-        [np.broadcast_to(v, (count, links)) / 2 for v in (size.width, size.height)], -1
+        [np.broadcast_to(v, (count, links)) / 2 for v in (section.width, section.height)], -1
     )
+    # Points of a link's outlines, and of the tip's face: places along it, and across in half axes
+    # from the middle of the section
+    around = np.tile(unit, (len(_ALONG), 1))
+    part = np.repeat(_ALONG, _AROUND)
+    face = np.concatenate([unit * part for part in _INNER])
+    links_at = np.repeat(np.arange(links), len(part))
+    links_at = np.append(links_at, np.full(len(face), links - 1))
+    part = np.append(np.tile(part, links), np.ones(len(face)))
+    across = np.concatenate([np.tile(around, (links, 1)), face]) + [0, 1]  # over the fabric
     for f, bodies in enumerate(lay.bodies):
-        half = halves[f]
+        half = halves[f] * size[:, bodies]
         span = float(params.length[f]) / links * whole
-        local = [
-            np.c_[np.full(_AROUND, part * s), unit * rim + [0, rim[1]]]
-            for s, rim in zip(span, half, strict=True)
-            for part in _ALONG
-        ]
-        face = np.concatenate([unit * half[-1] * part for part in _INNER]) + [0, half[-1, 1]]
-        local.append(np.c_[np.full(len(face), span[-1]), face])
-        links_at = np.repeat(np.arange(links), _AROUND * len(_ALONG))
-        links_at = np.append(links_at, np.full(len(face), links - 1))
-        at = np.array(bodies)[links_at]
-        local = np.concatenate(local)
-        along = (links_at + 0.5) * float(params.length[f]) / links + local[:, 0]
-        free = beyond_base(along, float(params.height[f]))
+        ahead = part * span[links_at]
+        local = across * half[:, links_at]
+        local = np.concatenate([np.broadcast_to(ahead[:, None], (*local.shape[:2], 1)), local], -1)
+        along = (links_at + 0.5) * float(params.length[f]) / links + ahead
+        free = beyond_base(along, float(params.height[f]) * size[:, bodies[:1], 1])
         beyond.append(free & (links_at >= first_on_palm(links) - 1))
-        offsets = np.einsum("spij,pj->spi", turn[:, at], local)
+        at = np.array(bodies)[links_at]
+        offsets = np.einsum("spij,spj->spi", turn[:, at], local)
         points.append(place[:, at] + offsets)
         owners.append(links_at)
-        sizes.append((span, *half.T))
+        sizes.append((span, *np.moveaxis(half, -1, 0)))
     depths = np.zeros((len(place), count, count))
     palm = np.zeros((len(place), count))
     for i, links_at in enumerate(owners):
-        free = points[i][:, beyond[i]]
-        x, y, z = np.moveaxis((free - place[:, None, 1]) @ turn[:, 1], -1, 0)
+        x, y, z = np.moveaxis((points[i] - place[:, None, 1]) @ turn[:, 1], -1, 0)
         inside = np.minimum(disc.radius - np.hypot(x, y), np.minimum(z, disc.thickness - z))
-        palm[:, i] = inside.max(1, initial=0)
+        palm[:, i] = inside.max(1, initial=0, where=beyond[i])
         for j, bodies in enumerate(lay.bodies):
             away = points[i][:, None] - place[:, bodies, None]
             depth = _depths(away @ turn[:, bodies], *sizes[j])
@@ -105,11 +110,12 @@ def _depths(local: np.ndarray, span: np.ndarray, a: np.ndarray, b: np.ndarray) -
 
     Args:
       span: Lengths of the links, shape (link,).
-      a: Half of their widths in the middle, same shape.
+      a: Half of their widths in the middle, shape (state, link).
+      b: Half of their heights, same shape.
     """
     x, y, z = np.moveaxis(local, -1, 0)
-    a = a[:, None]
-    b = b[:, None]
+    a = a[..., None]
+    b = b[..., None]
     units = np.abs([y / a, (z - b) / b])
     phi = np.maximum((units**4).sum(0) ** 0.25, 1e-9)
     slope = np.sqrt((units[0] / phi) ** 6 / a**2 + (units[1] / phi) ** 6 / b**2)

@@ -54,7 +54,7 @@ def _pictures(
     size: tuple[int, int],
     camera: Camera | Sequence[Camera],
 ) -> Iterator[np.ndarray]:
-    return painter.paint(scene, grasp, grasp.qpos[_steps(scene, grasp, times)], size, camera)
+    return painter.paint(scene, grasp, _steps(scene, grasp, times), size, camera)
 
 
 def _steps(scene: Scene, grasp: Replay, times: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """A grasp as meshes and motions: what a viewer needs to draw it at any time.
 
 Every vertex follows two bodies by linear blend skinning; those of rigid parts follow one.  Fingers
-are hulls (`codesign_jax.model.hull`), whatever surface the scene's contacts have.
+are hulls (`codesign_jax.model.hull`), whatever surface the scene's contacts have.  Where sections
+grow with their pressure, what is on a finger's links grows as its contacts do.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from codesign_jax import model
+from codesign_jax import model, section_sizes
 from codesign_jax.model import hull
 from codesign_jax.model.layout import mounts
 from codesign_jax.report.replay import Replay
@@ -55,10 +56,13 @@ class Part(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Poses of all bodies over time."""
+    """Poses of all bodies over time, and sizes of what is on them."""
 
     # Position [m] and unit quaternion (w, x, y, z) in the world, shape (time, body, 7)
     pose: np.ndarray
+    # Width (y) and height (z) over those of the part's mesh, shape (time, body, 2), see
+    # `section_sizes.of_bodies`
+    size: np.ndarray
     rate: float  # frames of a second
 
 
@@ -100,19 +104,21 @@ def motion(scene: Scene, grasp: Replay, *, rate: float = 25.0) -> Motion:
     """Poses at about so many frames of a second: the nearest that whole time steps allow."""
     h = scene.discretization.timestep
     every = max(1, round(1 / (rate * h)))
-    return Motion(poses(scene, grasp, grasp.qpos[::every]), 1 / (every * h))
+    return Motion(*at_steps(scene, grasp, np.arange(0, len(grasp.qpos), every)), 1 / (every * h))
 
 
-def poses(scene: Scene, grasp: Replay, qpos: np.ndarray) -> np.ndarray:
-    """Poses of all bodies at these positions, by MuJoCo's kinematics; see `Motion`."""
+def at_steps(scene: Scene, grasp: Replay, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses and sizes of all bodies at time steps, by MuJoCo's kinematics; see `Motion`."""
     compiled = model.compile_model(scene, grasp.params, grasp.trial)
     data = mujoco.MjData(compiled)
-    poses_now = []
-    for q in qpos:
+    poses = []
+    for q in grasp.qpos[steps]:
         data.qpos[:] = q
         mujoco.mj_kinematics(compiled, data)
-        poses_now.append(np.concatenate([data.xpos, data.xquat], 1))
-    return np.array(poses_now, np.float32)
+        poses.append(np.concatenate([data.xpos, data.xquat], 1))
+    ctrl = grasp.trace and grasp.trace.ctrl
+    size = section_sizes.of_bodies(scene, grasp.params, grasp.trial, ctrl)
+    return np.array(poses, np.float32), size[steps].astype(np.float32)
 
 
 def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -128,19 +134,21 @@ def object_mesh(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(body.vertices), np.asarray(body.faces)
 
 
-def vertices(part: Part, pose: np.ndarray) -> np.ndarray:
+def vertices(part: Part, pose: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Vertices of a part in the world [m], shape (vertex, 3).
 
     Args:
       pose: Poses of the bodies, shape (body, 7).
+      size: Width and height of what is on them, shape (body, 2), see `Motion`.
     """
     turn = np.zeros((len(pose), 9))
     for body, quat in enumerate(pose[:, 3:]):
         mujoco.mju_quat2Mat(turn[body], quat.astype(float))
     turn = turn.reshape(-1, 3, 3)
     place = pose[:, :3]
+    scale = np.insert(size, 0, 1.0, axis=1)  # nothing grows along a finger
     placed = [
-        place[b] + np.einsum("vij,vj->vi", turn[b], local)
+        place[b] + np.einsum("vij,vj->vi", turn[b], scale[b] * local)
         for b, local in zip(part.body.T, (part.first, part.second), strict=True)
     ]
     return (1 - part.weight[:, None]) * placed[0] + part.weight[:, None] * placed[1]

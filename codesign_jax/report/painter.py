@@ -90,24 +90,24 @@ class _Body(NamedTuple):
 def paint(
     scene: Scene,
     grasp: Replay,
-    qpos: np.ndarray,
+    steps: np.ndarray,
     size: tuple[int, int],
     camera: Camera | Sequence[Camera],
 ) -> Iterator[np.ndarray]:
-    """A picture for each row of qpos, shape (frame, nq): uint8, (height, width, 3).
+    """A picture for each of the grasp's time steps, shape (frame,): uint8, (height, width, 3).
 
     Args:
       camera: One that stays, or one for each picture.
     """
-    start, *poses = bodies.poses(scene, grasp, np.concatenate([grasp.qpos[:1], qpos]))
-    body = _body(bodies.parts(bodies.finer(scene, _RINGS, _POINTS), grasp), start)
-    cameras = [camera] * len(qpos) if isinstance(camera, Camera) else camera
+    start, *states = zip(*bodies.at_steps(scene, grasp, np.append(0, steps)), strict=True)
+    body = _body(bodies.parts(bodies.finer(scene, _RINGS, _POINTS), grasp), *start)
+    cameras = [camera] * len(steps) if isinstance(camera, Camera) else camera
     picture = None
     before = None
-    for pose, seen in zip(poses, cameras, strict=True):
-        now = (pose.tobytes(), seen)
+    for (pose, grown), seen in zip(states, cameras, strict=True):
+        now = (pose.tobytes(), grown.tobytes(), seen)
         if picture is None or now != before:  # what was lost stands still
-            picture = _picture(body, pose, seen, size, table=scene.effects.table)
+            picture = _picture(body, pose, grown, seen, size, table=scene.effects.table)
             before = now
         yield picture
 
@@ -115,12 +115,17 @@ def paint(
 def still(parts: Sequence[Part], camera: Camera, size: tuple[int, int]) -> np.ndarray:
     """A picture of rigid parts in the world's frame on the table, as `paint` makes them."""
     world = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
-    body = _body([*parts], world)
-    return _picture(body, world, camera, size, table=True)
+    as_made = np.ones((1, 2))
+    body = _body([*parts], world, as_made)
+    return _picture(body, world, as_made, camera, size, table=True)
 
 
-def _body(parts: list[Part], start: np.ndarray) -> _Body:
-    """What stays over time; edges are those of the poses at the start."""
+def _body(parts: list[Part], start: np.ndarray, grown: np.ndarray) -> _Body:
+    """What stays over time; edges are those at the start.
+
+    Args:
+      start: Poses of the bodies then, and `grown` sizes of what is on them, see `bodies.vertices`.
+    """
     first = np.cumsum([0, *(len(part.first) for part in parts)])
     face = np.concatenate([part.face + k for part, k in zip(parts, first, strict=False)])
     color = np.repeat([part.color for part in parts], [len(part.face) for part in parts], axis=0)
@@ -129,7 +134,7 @@ def _body(parts: list[Part], start: np.ndarray) -> _Body:
     owner = np.repeat(np.arange(len(parts)), [len(part.first) for part in parts])
     keys = np.column_stack([owner, np.round(vertices * 1e6).astype(np.int64)])
     _, same = np.unique(keys, axis=0, return_inverse=True)
-    triangles = np.concatenate([bodies.vertices(part, start) for part in parts])[face]
+    triangles = np.concatenate([bodies.vertices(part, start, grown) for part in parts])[face]
     around = _around(same.ravel()[face].ravel(), _areas(triangles))
     return _Body(parts, face, color, around)
 
@@ -164,10 +169,16 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _picture(
-    body: _Body, pose: np.ndarray, camera: Camera, size: tuple[int, int], *, table: bool
+    body: _Body,
+    pose: np.ndarray,
+    grown: np.ndarray,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    table: bool,
 ) -> np.ndarray:
-    """A picture, uint8, shape (height, width, 3)."""
-    vertices = np.concatenate([bodies.vertices(part, pose) for part in body.parts])
+    """A picture, uint8, shape (height, width, 3); `grown`: see `_body`."""
+    vertices = np.concatenate([bodies.vertices(part, pose, grown) for part in body.parts])
     triangles = vertices.astype(np.float32)[body.face]
     area = _areas(triangles)
     shadows = _Shadows(triangles, camera)

@@ -123,6 +123,7 @@ def data(scene: Scene, grasp: Replay) -> dict[str, Any]:
     return {
         "parts": [_part(part) for part in parts],
         "poses": _encode(motion.pose, np.float32),
+        "sizes": _encode(motion.size, np.float32) if (motion.size != 1).any() else None,
         "frames": frames,
         "bodies": count,
         "rate": motion.rate,

@@ -27,6 +27,7 @@ from codesign_jax.model import morphology, overlap
 from codesign_jax.optimize import Screened
 from codesign_jax.report import animation, bodies, viewer
 from codesign_jax.runs import selection
+from codesign_jax.scene import Scene
 from codesign_jax.scene.parameters import fingers_of
 from codesign_jax.scene.schema import InputError
 from codesign_jax.studio import process
@@ -212,7 +213,7 @@ class Tab:
 
     def _tell_overlap(self, shown: ShownGrasp) -> None:
         self._looked = True
-        self.send("overlap", _deepest(shown))
+        self.send("overlap", deepest_overlap(shown.bench.case.scene, shown.grasp))
 
     @property
     def _total(self) -> int:
@@ -412,15 +413,14 @@ def _grasp_message(shown: ShownGrasp) -> dict[str, Any]:
     }
 
 
-def _deepest(shown: ShownGrasp) -> str:
-    scene = shown.bench.case.scene
-    grasp = shown.grasp
-    motion = bodies.motion(scene, grasp)
+def deepest_overlap(scene: Scene, grasp: animation.Replay) -> str:
+    """How deep fingers stand in one another, in themselves and in the palm, in words."""
     end = min(scene.window[1], float(grasp.outcome.lost_time))
     times = np.linspace(min(scene.phases.approach, end), end, LOOKED_AT)
-    pose = motion.pose[np.minimum((times * motion.rate).astype(int), len(motion.pose) - 1)]
+    steps = (times / scene.discretization.timestep).astype(int)
+    pose, size = bodies.at_steps(scene, grasp, np.minimum(steps, len(grasp.qpos) - 1))
     turns = Rotation.from_quat(pose[..., 3:].reshape(-1, 4), scalar_first=True).as_matrix()
     turns = turns.reshape(*pose.shape[:2], 3, 3)
-    overlaps = overlap.overlaps(scene, grasp.params, pose[..., :3], turns)
+    overlaps = overlap.overlaps(scene, grasp.params, pose[..., :3], turns, size)
     fingers, palm = (1e3 * depth.max() for depth in overlaps)
     return f"Deepest overlap: {fingers:.1f} mm in fingers, {palm:.1f} mm in the palm"

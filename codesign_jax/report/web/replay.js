@@ -13,6 +13,7 @@
 //           frames of two bodies), body (uint16, 2 a vertex), weight (float32, of the second body) and
 //           face (uint32, 3 a triangle).  A vertex is (1 - w) T_first(first) + w T_second(second).
 //   poses   base64 float32 (frame, body, 7): position [m] and unit quaternion (w, x, y, z)
+//   sizes   base64 float32 (frame, body, 2): factors of y and z of what is on the bodies, or null for 1
 //   bodies, frames, rate [frames/s], phases [[name, end time s], ...], camera, table, object
 //   contacts  base64 arrays count (uint16, contacts of each frame) and values (float32, 7 a contact: number of the part
 //           that presses on the object, point [m], force on the object [N]), or null
@@ -53,13 +54,15 @@ function startReplay(root, data) {
   }
 
   // ---- meshes: triangles whose corners have a place and a normal each
-  let parts = [], poses, end, now, contacts;  // now: poses at the time shown
+  let parts = [], poses, sizes, end, now, grown, contacts;  // now: poses at the time shown; grown: sizes then
   function take(grasp) {
     data = grasp;
     for (const p of parts) gl.deleteBuffer(p.buffer);
     poses = decode(data.poses, Float32Array);
+    sizes = data.sizes && decode(data.sizes, Float32Array);
     end = (data.frames - 1) / data.rate;
     now = new Float32Array(7 * data.bodies);
+    grown = new Float32Array(2 * data.bodies).fill(1);
     parts = data.parts.map((p) => {
       const face = decode(p.face, Uint32Array), buffer = gl.createBuffer();
       const first = decode(p.first, Float32Array), second = decode(p.second, Float32Array);
@@ -125,7 +128,7 @@ function startReplay(root, data) {
     return slot;
   }
 
-  // Poses between two frames: positions and (normalised) quaternions are interpolated linearly.
+  // Poses between two frames: positions, sizes and (normalised) quaternions are interpolated linearly.
   function poseAt(time) {
     const at = Math.min(Math.max(time * data.rate, 0), data.frames - 1);
     const k = Math.min(Math.floor(at), Math.max(data.frames - 2, 0)), w = at - k;
@@ -139,11 +142,13 @@ function startReplay(root, data) {
       for (let i = 3; i < 7; i++) norm += now[o + i] ** 2;
       for (let i = 3; i < 7; i++) now[o + i] /= Math.sqrt(norm);
     }
+    const many = grown.length;
+    if (sizes) for (let i = 0; i < many; i++) grown[i] = (1 - w) * sizes[k * many + i] + w * sizes[next * many + i];
   }
 
   // Adds weight * T_body(local[3 v ...]) to out[3 v ...].
   function add(out, v, local, body, weight) {
-    const o = 7 * body, x = local[3 * v], y = local[3 * v + 1], z = local[3 * v + 2];
+    const o = 7 * body, x = local[3 * v], y = grown[2 * body] * local[3 * v + 1], z = grown[2 * body + 1] * local[3 * v + 2];
     const qw = now[o + 3], qx = now[o + 4], qy = now[o + 5], qz = now[o + 6];
     const tx = 2 * (qy * z - qz * y), ty = 2 * (qz * x - qx * z), tz = 2 * (qx * y - qy * x);
     out[3 * v] += weight * (now[o] + x + qw * tx + qy * tz - qz * ty);

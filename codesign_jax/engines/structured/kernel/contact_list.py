@@ -200,13 +200,15 @@ class ContactLayout:
 
 
 class ContactList:
-    """The contacts of a pair of bodies in a kernel; methods without "all" work on one item.
+    """The contacts of a pair of bodies in a kernel.
+
+    It is a value: `masked` and `counted` give another list of the same memory.
 
     Attributes:
       layout: What they are.
       cells: Their memory.
       cones: The cones by pair of bodies, numbers of a world.
-      like: Zeros of the lanes' shape and type.
+      block: The lanes; `size`: their number; `like`: zeros of their shape and type.
     """
 
     def __init__(self, layout: ContactLayout, cells: Cells, cones: dict[str, Cone]):
@@ -333,7 +335,7 @@ class ContactList:
             jax.lax.cond(self.touching(item), store, lambda: None)
 
     def begin(self, place: Place, cone: Cone, acc: Lanes, vel: Lanes) -> tuple[Place, Lanes]:
-        """Places whose share is zero where no candidate is, and their jar; see `create`."""
+        """Places whose share is zero where no candidate is, and their jar; rest as in `create`."""
         run = partial(as_candidates, margin(self.layout.scene))
         return lanewise(run, place, cone, acc, vel)
 
@@ -396,7 +398,7 @@ class ContactList:
         )
         self.write(Contact.jar, jar, item)
         hessian, force = lanewise(response, place, self.cone_at(item), jar)
-        self.write(Slot.hessian, hessian, item)
+        self.write(Slot.hessian, hessian, item)  # with a fixed place `TeamRing.hessian`
         return force
 
     def force_after(self, item: Item, place: Place, alpha: Lanes) -> Lanes:

@@ -188,7 +188,7 @@ class SdfCollision:
         on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
         rubs = self.frictions("object_table")
-        for i in range(on_table.layout.placement.items if on_table else 0):
+        for i in range(on_table.layout.places.count if on_table else 0):
             assert on_table is not None
             mine = range(i * layout.fingers, min((i + 1) * layout.fingers, len(slots)))
             place = Place(*self._deal([slots[k] for k in mine]))

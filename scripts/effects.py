@@ -1,6 +1,6 @@
 """What each effect costs and decides: python -m scripts.effects [--quick] [--page].
 
-Measures the default scene with each effect turned over, on what the default search recommends,
+Measures the default scene with each effect turned over, on designs that searches recommend,
 writes docs/data/effects.json and fills in docs/effects.md; --page only fills in.  Times are of
 `STEPS` steps from the middle of the lift on.  About 15 minutes on two idle cores.
 """
@@ -58,7 +58,7 @@ def changed(base: Scene, **effects: Any) -> Scene:
 
 
 def grasps(base: Scene, designs: int, trials: int) -> work.Worlds:
-    """What the default search recommends in its first seeds, each design in the same trials."""
+    """What searches recommend in their first seeds, each design in the same trials."""
     space = parameters.design_space(base.hand, "23d")
     params = jax.vmap(space.params)(jnp.asarray(work.winners()[:designs], jnp.float32))
     drawn = rollout.sample_trials(base, jax.random.key(0), trials)

@@ -4,7 +4,7 @@ python -m scripts.accuracy.motion --out runs/motion                   # paths; a
 python -m scripts.accuracy.motion --out runs/motion --share 1/7       # beside 6 other processes
 python -m scripts.accuracy.motion --out runs/motion --merge           # data and the page's table
 
-Hands that the default search recommended get two to four long, thin fingers, the softest that can
+Hands that searches recommended get two to four long, thin fingers, the softest that can
 be built.  Nothing touches them.  They are inflated, shaken for a second, and emptied in 50 ms
 (`energy.FREE`).  The tips' paths are compared with those of a finer step and more links; the energy
 that no work accounts for is that of the audit.

@@ -237,8 +237,9 @@ class Rise(NamedTuple):
 
 
 FREE_BOUND = 0.05
-"""Largest rise of a free hand over its energy at the release [chosen]: 1.3 % is the most that 60
-thin hands gain, and 2,700 % what the two of `THIN` gain with explicit velocity products."""
+"""Largest rise of a free hand over its energy at the release [chosen]: 0.4 % is the most that 60
+thin hands gain (docs/data/free_motion.json), and 2,700 % what the two of `THIN` gain with explicit
+velocity products."""
 
 
 def rises(accuracy: str = "standard") -> list[Rise]:

@@ -23,7 +23,7 @@ NUDGE = 1e-6
 
 
 WINNERS = Path(__file__).parents[2] / "docs/data/search/buildable.npz"
-"""Designs that the default search recommended at the end of each of 100 seeds."""
+"""Designs that searches at one accuracy recommended at the end of each of 100 seeds."""
 
 
 def winners(path: Path = WINNERS) -> np.ndarray:

@@ -164,7 +164,7 @@ def write(docs: Path, new: list[dict[str, Any]], commit: str | None = None) -> N
 def to_markdown(rows: list[dict[str, Any]]) -> str:
     """A line for each invariant: the measurement of the least margin; the data have the others."""
     lines = [
-        "| case | invariant | least margin | of | measured | bound | |",
+        "| case | invariant | least margin | engine, precision, step | measured | bound | remark |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     groups: dict[tuple, list[dict[str, Any]]] = {}

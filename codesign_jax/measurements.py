@@ -49,7 +49,7 @@ A mass stands for its weight under standard gravity, 9.80665 m/s^2.
 
 COLUMNS = {
     "pressure": ("pressure", "gauge pressure of the chamber; 0 where a file has no such column"),
-    "angle": ("angle", "angle between the finger's base and its free tip"),
+    "angle": ("angle", "angle by which the free finger bends over its length"),
     "tip_x": ("length", "place of the free tip along the unbent finger, from its base"),
     "tip_y": ("length", "place of the free tip across it, towards the bending"),
     "tip_force": ("force", "force on a tip that is held where it was, the rest free to bow"),

@@ -519,6 +519,10 @@ class Finger(Command, Subject):
     A file of measurements is a CSV whose head names columns and their units: angle_deg, tip_x_mm,
     tip_y_mm, tip_force_N and blocked_force_N stand beside pressure_kPa, deflection_mm and
     sideways_mm beside load_N, and drop_mm beside time_s (docs/measurements.md).
+
+    The model's finger bends over its whole length, but a real one not in its end walls: measure the
+    angle between two marks that are 15 mm from its ends, and give that angle times the finger's
+    length over the distance of the marks along it.
     """
 
     measured: Annotated[

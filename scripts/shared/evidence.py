@@ -78,8 +78,7 @@ SIMULATION = (
 )
 """Files that decide what a grasp does and how fast it is computed."""
 SAME = {
-    "51191a77": "e3ad8e40",  # items of contacts of one type
-    "f73d0b4e": "e3ad8e40",  # one contact list; depths of overlap are in no kernel
+    "8d25bb46": "e3ad8e40",  # one contact list; a step's contacts are values that are handed on
 }
 """Digests of code that was rearranged, with the digest of the code before.
 

@@ -115,21 +115,24 @@ class ReverseStep(Step):
         layout = self.layout
         bars = self.bars
         bars.begin()
-        state, bodies, world_object, now, centre = self.assemble(arm, pressure)
+        assembly = self.assemble(arm, pressure)
+        state = assembly.state
+        bodies = assembly.bodies
+        now = bodies["now"]
         go = lanes([moved], (), wide=False)
         before, acc_bar = self._integration(state, bodies, now, go)
         if layout.held:
-            friction_memory.reverse(self, bars, go)
+            friction_memory.reverse(self, assembly.contacts, bars, go)
         # The right side of wrist and object stands in the place of their only forces.
         right = {"smooth_wrist": acc_bar[0], "smooth_object": acc_bar[1]}
         right["smooth_palm"] = _none(bodies["palm"].smooth_palm)
-        problem = Problem(self, bodies["palm"]._replace(**right))
+        problem = Problem(self, assembly.contacts, bodies["palm"]._replace(**right))
         virtual = AdjointSolve(problem).solve()
-        ContactsVjp(self, state, bodies, world_object, virtual, bars).run(pressure)
-        sweep = ResidualVjp(self, state, bodies, bars)
+        ContactsVjp(self, assembly, virtual, bars).run(pressure)
+        sweep = ResidualVjp(self, assembly, bars)
         metered = layout.scene.effects.air_mass
         end = chambers.end_pressures(self, pressure) if metered else pressure
-        base, wrist = sweep.fingers(end, self._centre_bar(centre, shown.distance))
+        base, wrist = sweep.fingers(end, self._centre_bar(assembly.centre, shown.distance))
         if metered:
             chambers.reverse(self, bars, pressure)
         base = sweep.with_contacts(base, layout.links + 1)

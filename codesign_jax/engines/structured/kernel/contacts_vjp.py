@@ -17,7 +17,6 @@ from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
 from codesign_jax.engines.structured.kernel.kinds import KINDS, BodyMotion, CentreLine
 from codesign_jax.engines.structured.kernel.memory import any_of, zeros
-from codesign_jax.engines.structured.kernel.objects import WorldObject
 from codesign_jax.engines.structured.kernel.pairing import FingerPairing
 from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate
@@ -34,7 +33,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     World,
 )
 from codesign_jax.engines.structured.kernel.self_collision import neighbours
-from codesign_jax.engines.structured.kernel.step import Step
+from codesign_jax.engines.structured.kernel.step import Assembly, Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
 from codesign_jax.engines.structured.laws.cones import friction_by_contact, which_cone
@@ -54,14 +53,16 @@ class ContactsVjp:
     def __init__(
         self,
         step: Step,
-        state: dict[str, Lanes],
-        bodies: dict[str, Any],
-        world_object: WorldObject,
+        assembly: Assembly,
         virtual: Iterate,
         bars: CotangentTables,
     ):
+        bodies = assembly.bodies
+        world_object = assembly.world_object
         self.step = step
         self.layout = step.layout
+        self.contacts = assembly.contacts
+        self.search = assembly.search
         self.world_object = world_object
         self.bars = bars
         self.scratch = step.scratch
@@ -73,7 +74,7 @@ class ContactsVjp:
         palm = bodies["place"], bodies["frame"], bodies["vel"], now.palm_acc, virtual.palm_acc
         self.palm = BodyMotion(*palm)
         self.object = {"columns": bodies["columns"], "object_vel": bodies["object_vel"]}
-        self.object |= {"position": state["position"]}
+        self.object |= {"position": assembly.state["position"]}
         self.fixed: dict[str, Any] = {"object_id": step.constant(World.object_id)}
         self.fixed |= {"object_acc": now.object_acc, "object_along": virtual.object_acc}
         if world_object.mesh is not None:
@@ -88,9 +89,9 @@ class ContactsVjp:
           pressure: Of the chambers.
         """
         self._clear()
-        if (self_contacts := self.step.self_contacts) is not None:
+        if (self_contacts := self.contacts.self_contacts) is not None:
             self_contacts.each(self._slot)
-        for contacts in self.step.field_contacts:
+        for contacts in self.contacts.field_contacts.values():
             reverse = self._points if contacts.layout.name == "object_table" else self._rings
             contacts.each(partial(self._where_touching, contacts, reverse))
         if self.layout.grows:
@@ -265,7 +266,7 @@ class ContactsVjp:
     def _kinds_of(self, item: Item) -> dict[str, jax.Array]:
         """Lanes of the rings of a slot's contacts, by pair of bodies."""
         pairing = item.pairing
-        contacts = self.step.self_contacts
+        contacts = self.contacts.self_contacts
         assert contacts is not None
         owner = contacts.read(Remembered.owner, item).lane > 0.5
         live = owner & (contacts.read(Contact.share, item).lane > 0)
@@ -285,7 +286,7 @@ class ContactsVjp:
         return {pair: which for pair, which in by_pair.items() if on[pair]}
 
     def _reverse_slot(self, pair: str, item: Item, live: jax.Array) -> None:
-        contacts = self.step.self_contacts
+        contacts = self.contacts.self_contacts
         assert contacts is not None
         remembered = contacts.read(Remembered.ring, item).lane.astype(jnp.int32)
         number = jax.lax.rem(remembered, self._count)
@@ -316,7 +317,7 @@ class ContactsVjp:
         if pair == "finger_palm":
             leave = lambda bars: self.add_body(bars[0]._asdict(), self.palm_row)  # noqa: E731
             return (self.palm, ()), {}, leave
-        contacts = self.step.self_contacts
+        contacts = self.contacts.self_contacts
         assert contacts is not None
         if not self.layout.hull:
             return self._sphere(pairing, jax.lax.div(remembered, self._count))
@@ -328,9 +329,8 @@ class ContactsVjp:
         last = jnp.where(link == self.layout.links, self.like + 1.0, self.like)
         end: Any = 1
         if itself:
-            search = self.step.search
-            assert search is not None
-            end = search.last_of(jax.lax.rem(remembered, self._count), link)
+            assert self.search is not None
+            end = self.search.last_of(jax.lax.rem(remembered, self._count), link)
         fixed = {"last": self._float(last), "end": self._float(end)}
         lane = self.lane if itself else pairing.lane
 
@@ -378,10 +378,9 @@ class ContactsVjp:
 
     def _sections(self, row: jax.Array) -> list[jax.Array]:
         """Rings whose sections segments have, and the one before has; see `ring_at`."""
-        search = self.step.search
-        assert search is not None
+        assert self.search is not None
         places = (1, 0) if self.layout.tapered else (1,)
-        return [jnp.zeros_like(row) + search.ring_at(row + k) for k in places]
+        return [jnp.zeros_like(row) + self.search.ring_at(row + k) for k in places]
 
     @property
     def _count(self) -> jax.Array:

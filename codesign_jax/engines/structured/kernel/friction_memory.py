@@ -30,6 +30,7 @@ from codesign_jax.engines.structured.kernel.problem import Problem
 from codesign_jax.engines.structured.kernel.rows import Contact, HeldBar, Scratch, Slot, Virtual
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
 from codesign_jax.engines.structured.kernel.sides import OwnSide, Sides
+from codesign_jax.engines.structured.kernel.step_contacts import StepContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, apply_rows, dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -55,8 +56,20 @@ def held_by_pairing(step: StepMemory, self_contacts: ContactList, row: Any) -> l
     return [step.finger_state.read(BETWEEN_FINGERS, row + self_contacts.layout.first)]
 
 
-def held_by_item(step: StepMemory, contacts: ContactList, item: Item) -> tuple[Lanes, Lanes] | None:
-    """What an item's contacts hold, (3, k): along the world's axes, and as the state has it."""
+def held_by_item(
+    step: StepMemory, contacts: ContactList, columns: Lanes, item: Item
+) -> tuple[Lanes, Lanes] | None:
+    """What an item's contacts hold, (3, k): along the world's axes, and as the state has it.
+
+    Args:
+      step: The step's memory.
+      contacts: The item's list.
+      columns: Columns of the object's orientation, shape (3, 3, 1, world).
+      item: The item.
+
+    Returns:
+      None if the list's contacts hold nothing.
+    """
     if not contacts.layout.holds:
         return None
     name = f"held.{contacts.layout.name}"
@@ -69,7 +82,7 @@ def held_by_item(step: StepMemory, contacts: ContactList, item: Item) -> tuple[L
         held_friction = lanewise(lambda rows: jnp.stack(rows, 1), rows)
     if not contacts.layout.on_object:
         return held_friction, held_friction
-    return lanewise(in_world, step.columns, held_friction), held_friction
+    return lanewise(in_world, columns, held_friction), held_friction
 
 
 def in_world(columns: jax.Array, held_friction: jax.Array) -> jax.Array:
@@ -83,15 +96,21 @@ def clear(step: StepMemory) -> None:
         step.scratch.write(Scratch.new_held_friction, zeros((3,), step.like), item)
 
 
-def store(step: StepMemory, good: jax.Array) -> None:
-    """Ends a step of the worlds that have moved."""
+def store(step: StepMemory, step_contacts: StepContacts, good: jax.Array) -> None:
+    """Ends a step of the worlds that have moved.
+
+    Args:
+      step: The step's memory.
+      step_contacts: The step's contacts.
+      good: Lanes of these worlds, bool, shape (lane,).
+    """
     state = step.finger_state
     mask = lanes([good], (), wide=False)
     for item in range(pairings(step)):
         new = step.scratch.read(Scratch.new_held_friction, item)
         old = state.read(BETWEEN_FINGERS, item)
         state.write(BETWEEN_FINGERS, lanewise(jnp.where, mask, new, old), item)
-    for contacts in step.contacts.values():
+    for contacts in step_contacts.field_contacts.values():
         if contacts.layout.holds:
             _store(step, contacts, mask)
 
@@ -151,7 +170,7 @@ def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
 
 def _keep_of_list(problem: Problem, contacts: ContactList, alpha: Lanes, mask: Lanes) -> None:
     """Keeps what a list's contacts hold behind the step, in the worlds of the mask."""
-    axes = held_axes(problem.memory, contacts)
+    axes = held_axes(problem, contacts)
 
     def after(mask, place, cone, alpha, jar, step, old, axes):
         new = behind(make_contacts(place, cone), jar + alpha * step, old, axes)
@@ -171,9 +190,9 @@ def _keep_of_list(problem: Problem, contacts: ContactList, alpha: Lanes, mask: L
     contacts.each(keep_item)
 
 
-def held_axes(step: StepMemory, contacts: ContactList) -> Lanes | None:
+def held_axes(problem: Problem, contacts: ContactList) -> Lanes | None:
     """Columns of the axes along which contacts hold, None for the world's."""
-    return step.columns if contacts.layout.on_object else None
+    return problem.columns if contacts.layout.on_object else None
 
 
 def behind(
@@ -214,18 +233,26 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
     any_of(which & among.touching_worlds(), keep_all)
 
 
-def reverse(step: StepMemory, bars: CotangentTables, go: Lanes) -> None:
+def reverse(
+    step: StepMemory, step_contacts: StepContacts, bars: CotangentTables, go: Lanes
+) -> None:
     """Leaves the cotangents of what contacts hold after the step to the contacts.
 
     As "held_bar" of each, and as "sums_bar" of fingers on one another.  The state's become those
     before a step of which contacts add their part.
+
+    Args:
+      step: The step's memory.
+      step_contacts: The step's contacts.
+      bars: The tables of cotangents.
+      go: Worlds that took the step, bool, lanes of a world.
     """
-    for contacts in step.contacts.values():
+    for contacts in step_contacts.field_contacts.values():
         if contacts.layout.holds:
             _reverse(step, bars, contacts, go)
     if pairings(step):
-        assert step.self_contacts is not None
-        _reverse_fingers(step, bars, step.self_contacts, go)
+        assert step_contacts.self_contacts is not None
+        _reverse_fingers(step, bars, step_contacts.self_contacts, go)
 
 
 def _reverse(step: StepMemory, bars: CotangentTables, contacts: ContactList, go: Lanes) -> None:
@@ -267,7 +294,7 @@ def wrench_of_cotangents(problem: Problem, contacts: ContactList, item: Item) ->
 
     It is the cotangent of jar, through the force, of what they hold behind the step.
     """
-    axes = held_axes(problem.memory, contacts)
+    axes = held_axes(problem, contacts)
 
     def of_jar(jar, place, cone, held, bars, axes):
         return sum_axis(dot(bars, behind(make_contacts(place, cone), jar, held, axes)), 0)

@@ -9,6 +9,7 @@ from codesign_jax.engines.structured.kernel.chambers import Chambers
 from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.memory import tree_add_scaled, zeros
 from codesign_jax.engines.structured.kernel.rows import Air, Hand, Scratch
+from codesign_jax.engines.structured.kernel.step_contacts import StepContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanewise import Lanes, lanewise
 from codesign_jax.engines.structured.laws.inertia import Body, Centred
@@ -48,6 +49,7 @@ class Problem:
       palm: Palm, wrist and object.
       links: Moving links of a finger; `block`: the lanes; `like`: zeros of their shape and type.
       rigid: Whether the wrist's accelerations are known and no unknowns.
+      columns: Columns of the object's orientation, shape (3, 3, 1, world).
       self_contacts: Contacts of the hand with itself; None without.
       sides: Their sides; None without.
       per_link: Contacts of the fingers with what is no finger, whose items are links.
@@ -56,16 +58,18 @@ class Problem:
       chambers: Chambers with a mass of air; None without the effect.
     """
 
-    def __init__(self, memory: StepMemory, palm: Palm):
+    def __init__(self, memory: StepMemory, contacts: StepContacts, palm: Palm):
         self.memory = memory
         self.palm = palm
         self.links = memory.layout.links
         self.block = memory.block
         self.rigid = not memory.layout.scene.effects.wrist
-        self.self_contacts = memory.self_contacts
-        self.sides = memory.sides
-        self.per_link = [c for c in memory.field_contacts if c.layout.per_link]
-        self.dealt = [c for c in memory.field_contacts if not c.layout.per_link]
+        self.columns = contacts.columns
+        self.self_contacts = contacts.self_contacts
+        self.sides = contacts.sides
+        fixed = contacts.field_contacts.values()
+        self.per_link = [c for c in fixed if c.layout.per_link]
+        self.dealt = [c for c in fixed if not c.layout.per_link]
         self.like = jnp.zeros((self.block.size,), palm.armature.dtype)
         self.chambers = Chambers(memory) if Air.air_step in memory.scratch else None
 

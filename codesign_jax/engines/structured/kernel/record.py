@@ -34,6 +34,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     WorldState,
 )
 from codesign_jax.engines.structured.kernel.shared_memory import team_sum
+from codesign_jax.engines.structured.kernel.step_contacts import StepContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import dot, sum_axis
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -114,23 +115,32 @@ def _chord_of(problem: Problem, contacts: ContactList, item: Item, chord: Iterat
     return relative(name, link, chord.palm_acc, chord.object_acc)
 
 
-def write(step: StepMemory, table: BoundTable) -> None:
-    """Writes the forces of the step's contacts, at its accelerations; before it is integrated."""
-    for contacts in step.field_contacts:
-        _write_list(step, contacts.layout.name, contacts, table)
-    if (pairs := step.self_contacts) is not None:
+def write(step: StepMemory, step_contacts: StepContacts, table: BoundTable) -> None:
+    """Writes the forces of the step's contacts, at its accelerations; before it is integrated.
+
+    Args:
+      step: The step's memory.
+      step_contacts: The step's contacts, whose jar is that of its accelerations, see `settle`.
+      table: Where they are written, rows of `rows.ForceSum`, `TouchForce` and `PairForce`.
+    """
+    for contacts in step_contacts.field_contacts.values():
+        _write_list(step, contacts, step_contacts.columns, table)
+    if (pairs := step_contacts.self_contacts) is not None:
         _each(pairs.layout.slots.rows, lambda row: _write_pairing(step, pairs, row, table))
 
 
-def _write_list(step: StepMemory, name: str, contacts: ContactList, table: BoundTable) -> None:
+def _write_list(step: StepMemory, contacts: ContactList, columns: Lanes, table: BoundTable) -> None:
     """Writes what a list's contacts do, and with `stores_all` each of them."""
+    name = contacts.layout.name
     energy = f"{name}.{ForceSum.energy}" in table
     none = [zeros((3,), step.like), *[zeros((), step.like)] * (2 + energy)]
 
     def add(item: Item, sums: list[Lanes]) -> list[Lanes]:
         def added() -> list[Lanes]:
             numbers = contacts.place(item), contacts.cone_at(item), contacts.read(Contact.jar, item)
-            held = friction_memory.held_by_item(step, contacts, item) if energy else None
+            held = None
+            if energy:
+                held = friction_memory.held_by_item(step, contacts, columns, item)
             return lanewise(_add_item, sums, *numbers, None if held is None else held[0])
 
         return choose(contacts.touching(item), added, sums, contacts.size)
@@ -143,10 +153,10 @@ def _write_list(step: StepMemory, name: str, contacts: ContactList, table: Bound
     for field, value in zip(fields, (force, pressing, depth, *stored), strict=False):
         table.write(f"{name}.{field}", value)
     if contacts.layout.stores_all:
-        _write_rings(step, name, contacts, table)
+        _write_rings(step, contacts, table)
 
 
-def _write_rings(step: StepMemory, name: str, contacts: ContactList, table: BoundTable) -> None:
+def _write_rings(step: StepMemory, contacts: ContactList, table: BoundTable) -> None:
     """Writes place and force of each of a list's rings, those that do not touch as well."""
     position = step.world_state.read(WorldState.position)
 
@@ -157,7 +167,7 @@ def _write_rings(step: StepMemory, name: str, contacts: ContactList, table: Boun
         point = lanewise(lambda x, p: x + p[:, None], place.point, position)
         values = point, place.normal, place.gap, force
         for field, value in zip(TouchForce.fields(), values, strict=True):
-            contacts.record(table, f"{name}.{field}", value, item)
+            contacts.record(table, f"{contacts.layout.name}.{field}", value, item)
 
     contacts.each(put)
 

@@ -20,7 +20,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     Hand,
     Virtual,
 )
-from codesign_jax.engines.structured.kernel.step import WRIST, Step, bases_before
+from codesign_jax.engines.structured.kernel.step import WRIST, Assembly, Step, bases_before
 from codesign_jax.engines.structured.kernel.step_memory import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanes import apply_columns
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -35,19 +35,19 @@ class ResidualVjp:
     def __init__(
         self,
         step: Step,
-        state: dict[str, Lanes],
-        bodies: dict[str, Any],
+        assembly: Assembly,
         bars: CotangentTables,
     ):
         self.step = step
         self.layout = step.layout
-        self.bodies = bodies
+        self.bodies = assembly.bodies
+        self.fast = assembly.fast
         self.scratch = step.scratch
         self.bars = bars
         self.block = step.block
         self.like = step.like
         self.power_bar = lanes([self.like + 1.0], (), wide=True)
-        self.wrist = {n: state[n] for n in WRIST}
+        self.wrist = {n: assembly.state[n] for n in WRIST}
 
     def chain(self, i: Any) -> LinkMotion:
         """What the link before joint i hands on."""
@@ -105,7 +105,7 @@ class ResidualVjp:
         """
         wrist = {n: zeros(value.shape[:1], self.like) for n, value in self.wrist.items()}
         empty = FastMotion(*(self.none(n) for n in FastMotion._fields)), wrist
-        bars, wrist = choose(self.step.fast, self._carried_momenta, empty, self.layout.size)
+        bars, wrist = choose(self.fast, self._carried_momenta, empty, self.layout.size)
         return _add(base, **bars._asdict()), self.block.sum(wrist)
 
     def _carried_momenta(self) -> tuple[FastMotion, dict[str, Lanes]]:

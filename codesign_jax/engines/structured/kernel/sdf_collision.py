@@ -25,6 +25,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     WorldState,
 )
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision, closed
+from codesign_jax.engines.structured.kernel.step_contacts import StepContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, cross, dot, total
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -46,13 +47,19 @@ FAR = 1e3
 class SdfCollision:
     """Enters the contacts of fingers, palm and object with object and table."""
 
-    def __init__(self, step: StepMemory, bodies: dict[str, Any], world_object: WorldObject):
+    def __init__(
+        self,
+        step: StepMemory,
+        contacts: StepContacts,
+        bodies: dict[str, Any],
+        world_object: WorldObject,
+    ):
         self.step = step
         self.layout = step.layout
         self.bodies = bodies
         self.world_object = world_object
-        self.contacts = step.contacts
-        self.names = [c.layout.name for c in step.field_contacts if c.layout.per_link]
+        self.contacts = contacts.field_contacts
+        self.names = [name for name, c in self.contacts.items() if c.layout.per_link]
         self.surface = step.layout.scene.effects.surface
 
     def looks(self, name: str) -> list[Callable[[Lanes], tuple[Lanes, Lanes]]]:
@@ -88,6 +95,10 @@ class SdfCollision:
             relative(name, vel, bodies["vel"], bodies["object_vel"]),
         )
 
+    def held(self, contacts: ContactList, item: Item) -> tuple[Lanes, Lanes] | None:
+        """What an item's contacts hold of friction, see `friction_memory.held_by_item`."""
+        return friction_memory.held_by_item(self.step, contacts, self.bodies["columns"], item)
+
     def of_link(self, i: Any, carry: tuple) -> None:
         """Contacts of a link; carry: its origin, frame, velocity, bias and acceleration."""
         if self.layout.team > 1:  # see `of_rings`
@@ -96,7 +107,7 @@ class SdfCollision:
         for name in self.names:
             numbers = self.numbers(i)
             centre = lanewise(ring_centres, origin, frame, numbers)
-            hold = friction_memory.held_by_item(self.step, self.contacts[name], at(i))
+            hold = self.held(self.contacts[name], at(i))
             self.on_field(
                 name, at(i), numbers, frame, centre, self.moves(name, link_acc, vel), hold
             )
@@ -113,7 +124,7 @@ class SdfCollision:
                 moves = self.moves(
                     name, *(search.side_of(n, row) for n in (Side.link_acc, Side.vel))
                 )
-                hold = friction_memory.held_by_item(self.step, contacts, item)
+                hold = self.held(contacts, item)
                 self.on_field(name, item, numbers, frame, centre, moves, hold)
 
             contacts.each(ring)
@@ -183,7 +194,7 @@ class SdfCollision:
             centre = lanewise(ring_centres, bodies["place"], bodies["frame"], numbers)
             for name in palm:
                 moves = self.moves(name, None, None)
-                hold = friction_memory.held_by_item(self.step, self.contacts[name], at(i))
+                hold = self.held(self.contacts[name], at(i))
                 self.on_field(name, at(i), numbers, bodies["frame"], centre, moves, hold)
         on_table = self.contacts.get("object_table")
         slots = self._table_points(state) if on_table else []
@@ -196,7 +207,7 @@ class SdfCollision:
             if rubs is not None:
                 (friction,) = self._deal([(rubs[:, k],) for k in mine])
             moves = self.moves("object_table", None, None)
-            hold = friction_memory.held_by_item(self.step, on_table, at(i))
+            hold = self.held(on_table, at(i))
             on_table.create(at(i), place, *moves, friction=friction, hold=hold)
 
     def _table_points(self, state: dict) -> list[Place]:

@@ -36,6 +36,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     Slot,
     WorldOptions,
 )
+from codesign_jax.engines.structured.kernel.sides import Sides
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, cross, dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
@@ -66,11 +67,12 @@ the speed with which it moves as the link turns [ours]."""
 class SelfCollision:
     """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
 
-    def __init__(self, step: StepMemory, self_contacts: ContactList, bodies: dict[str, Any]):
+    def __init__(
+        self, step: StepMemory, self_contacts: ContactList, sides: Sides, bodies: dict[str, Any]
+    ):
         self.step = step
-        assert step.sides is not None
         self.contacts = self_contacts
-        self.sides = step.sides
+        self.sides = sides
         self.layout = step.layout
         self.scratch = step.scratch
         self.block = step.block

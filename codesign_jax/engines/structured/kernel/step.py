@@ -7,7 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel import chambers, friction_memory, objects, record
+from codesign_jax.engines.structured.kernel import (
+    chambers,
+    friction_memory,
+    objects,
+    record,
+    step_contacts,
+)
 from codesign_jax.engines.structured.kernel.memory import BoundTable, anywhere, loop, zeros
 from codesign_jax.engines.structured.kernel.newton import Convergence, Limits, Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
@@ -15,6 +21,7 @@ from codesign_jax.engines.structured.kernel.problem import Iterate, Palm, Proble
 from codesign_jax.engines.structured.kernel.rows import Hand, Scratch, WorldState
 from codesign_jax.engines.structured.kernel.sdf_collision import SdfCollision
 from codesign_jax.engines.structured.kernel.self_collision import SelfCollision
+from codesign_jax.engines.structured.kernel.step_contacts import StepContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.kernel.team_solver import team_rows
 from codesign_jax.engines.structured.lanes import apply_columns, dot, total
@@ -37,17 +44,17 @@ class Assembly(NamedTuple):
     """A step's problem, but for what is in the scratch table."""
 
     state: dict[str, Lanes]  # Of wrist and object, by row of `rows.WorldState`
-    bodies: dict[str, Any]  # What `palm_and_object` returns
+    # What `palm_and_object` returns; "now" is the warm start, the accelerations of the last step
+    bodies: dict[str, Any]
     world_object: WorldObject  # The object of each lane's world
-    now: Iterate  # The warm start: accelerations of the last step
+    contacts: StepContacts  # Those that were found
+    search: SelfCollision | None  # What found those of the hand with itself; None without
+    fast: jax.Array  # Whether a link turns by more than `inertia.LARGEST_TURN`, bool, a scalar
     centre: Lanes  # The hand's centre from the object's [m], shape (3, 1, world)
 
 
 class Step(StepMemory):
     """One time step of a block."""
-
-    search: SelfCollision | None = None
-    fast: jax.Array  # Whether a link turns by more than `inertia.LARGEST_TURN` in this step
 
     def advance(
         self,
@@ -78,22 +85,23 @@ class Step(StepMemory):
           the worlds that have moved, and so go on.
         """
         layout = self.layout
-        state, bodies, _, now, centre = self.assemble(arm, pressure)
-        jax.lax.cond(begins, lambda: self._keep_overlap(state), lambda: None)
+        assembly = self.assemble(arm, pressure)
+        now = assembly.bodies["now"]
+        jax.lax.cond(begins, lambda: self._keep_overlap(assembly), lambda: None)
         convergence = Convergence(lanes([self.like], (), wide=False), jnp.int32(0))
         if limits.iterations:
-            problem = Problem(self, bodies["palm"])
+            problem = Problem(self, assembly.contacts, assembly.bodies["palm"])
             now, convergence = Newton(problem).solve(now, waiting, *limits)
         if recorded is not None:
-            record.write(self, recorded)
-        distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), centre).lane
-        height = state["position"][2].lane
+            record.write(self, assembly.contacts, recorded)
+        distance = lanewise(lambda c: jnp.sqrt(dot(c, c)), assembly.centre).lane
+        height = assembly.state["position"][2].lane
         goes_on = waiting & undecided(distance, height)
         overflow = {}
         if layout.has_slots:
-            overflow["overflow"] = self._overflow(waiting)
+            overflow["overflow"] = self._overflow(assembly.contacts, waiting)
             goes_on &= overflow["overflow"] == 0
-        new_speed, good = semi_implicit_euler(self, state, bodies, now, goes_on, speed)
+        new_speed, good = semi_implicit_euler(self, assembly, now, goes_on, speed)
         count = jnp.full_like(height, convergence.count)
         # Decrements of decided worlds are reported as 0; no iterations are spent on them.
         decrement = jnp.where(waiting, convergence.decrement.lane, 0.0)
@@ -112,22 +120,22 @@ class Step(StepMemory):
         run = partial(palm_and_object, layout.scene.discretization.timestep)
         bodies = lanewise(run, state, arm, self.palm_constants())
         world_object = objects.read(layout.scene, self.block, self.world, self.hand, self.grid)
-        self.columns = bodies["columns"]
         if layout.grows:
             self.grow(pressure)
-        self.bind_contacts()
-        now, centre = self._forward(state, bodies, pressure, world_object)
-        return Assembly(state, bodies, world_object, now, centre)
+        contacts = step_contacts.begin(self, bodies["columns"])
+        return self._forward(state, bodies, pressure, world_object, contacts)
 
-    def _keep_overlap(self, state: dict) -> None:
+    def _keep_overlap(self, assembly: Assembly) -> None:
         """Keeps the largest overlap of two bodies of worlds whose grasp begins in this step.
 
         A world with a larger one than the scene's limit is refused; `engines.depths` says the
         same of worlds that no kernel simulates.
         """
-        depths = [c.deepest().lane for c in self.field_contacts]
-        if self.search:
-            depths.append(self.search.deepest(self.self_contacts).lane)
+        state = assembly.state
+        contacts = assembly.contacts
+        depths = [c.deepest().lane for c in contacts.field_contacts.values()]
+        if assembly.search and contacts.self_contacts:
+            depths.append(assembly.search.deepest(contacts.self_contacts).lane)
         deepest = self.like
         for depth in depths:
             deepest = jnp.maximum(deepest, depth)
@@ -137,10 +145,10 @@ class Step(StepMemory):
         begun = jnp.where(state["step"].lane > 0, state["overlap"].lane, deepest)
         self.world_state.write(WorldState.overlap, lanes([begun], (), wide=False))
 
-    def _overflow(self, waiting: jax.Array) -> jax.Array:
+    def _overflow(self, contacts: StepContacts, waiting: jax.Array) -> jax.Array:
         """One for worlds that had too few slots for their contacts in this step, else zero."""
-        assert self.self_contacts is not None
-        most = self.block.fold(self.self_contacts.overflow(), jnp.maximum)
+        assert contacts.self_contacts is not None
+        most = self.block.fold(contacts.self_contacts.overflow(), jnp.maximum)
         return jnp.where(waiting & (most > 0), 1.0, 0.0).astype(most.dtype)
 
     def store_chain(self, i: Any, chain: tuple) -> None:
@@ -184,24 +192,26 @@ class Step(StepMemory):
         vel, bias, link_acc = (lanewise(jnp.add, v, wide) for v in palm)
         return origin, frame, vel, bias, link_acc, weight
 
-    def _forward(self, state: dict, bodies: dict, pressure: Lanes, world_object: WorldObject):
-        """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
-
-        Returns the warm start and the hand's centre from the object's.
-        """
+    def _forward(
+        self,
+        state: dict,
+        bodies: dict,
+        pressure: Lanes,
+        world_object: WorldObject,
+        contacts: StepContacts,
+    ) -> Assembly:
+        """Bodies, forces and contacts from the palm to the tips, left in the scratch table."""
         layout = self.layout
-        now = bodies["now"]
         like = self.like
         start = self._bases(bodies)
         origin, frame, vel, _, link_acc, _ = start
         if layout.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
-        self_contacts = self.self_contacts
-        search = None if self_contacts is None else SelfCollision(self, self_contacts, bodies)
-        self.search = search
-        if search:
+        search = None
+        if contacts.self_contacts and contacts.sides:
+            search = SelfCollision(self, contacts.self_contacts, contacts.sides, bodies)
             search.start(link_acc, vel, frame, origin)
-        fields = SdfCollision(self, bodies, world_object)
+        fields = SdfCollision(self, contacts, bodies, world_object)
         zero_acc = zeros((6,), like)
 
         def link(i: Any, carry: tuple) -> tuple:
@@ -230,17 +240,18 @@ class Step(StepMemory):
         start = (*start, lanewise(jnp.ones_like, start[0][0]))
         *chain, middle, least = loop(layout.links, link, start, layout.size)
         self.store_chain(layout.links, tuple(chain))
-        self.fast = anywhere(least.lane < 1)
-        jax.lax.cond(self.fast, lambda: self._carry_momenta(state, start[:3]), lambda: None)
+        fast = anywhere(least.lane < 1)
+        jax.lax.cond(fast, lambda: self._carry_momenta(state, start[:3]), lambda: None)
         if search:
             search.find()
         if search and layout.team > 1:
             fields.of_rings(search)
-        self.end_search()
+        counted = contacts.counted()
         fields.of_palm_and_object(state)
         count = layout.num_fingers * layout.links
         middle = self.block.sum(middle)
-        return now, lanewise(lambda c: c / count, middle)
+        centre = lanewise(lambda c: c / count, middle)
+        return Assembly(state, bodies, world_object, counted, search, fast, centre)
 
 
 def add_weighted(total, centre, weight):
@@ -401,12 +412,12 @@ def carried_momentum(scene: Scene, now: tuple, before: tuple, constants: dict, j
 
 
 def semi_implicit_euler(
-    step: StepMemory, state: dict, bodies: dict, now: Iterate, goes_on: Any, speed: Any
+    step: StepMemory, assembly: Assembly, now: Iterate, goes_on: Any, speed: Any
 ):
     """Semi-implicit Euler; worlds that are decided or whose step fails stay as they were.
 
     Args:
-      bodies: What `palm_and_object` returns; `now`: the accelerations of the step.
+      assembly: The step's problem; `now`: the accelerations of the step.
       goes_on: Worlds that are undecided and take the step, bool, shape (lane,).
       speed: Largest velocity before the step, shape (lane,).
 
@@ -414,7 +425,9 @@ def semi_implicit_euler(
     """
     layout = step.layout
     h = layout.scene.discretization.timestep
-    new = lanewise(partial(body_after_step, h), state, bodies["columns"], now.wrist, now.object_acc)
+    state = assembly.state
+    columns = assembly.bodies["columns"]
+    new = lanewise(partial(body_after_step, h), state, columns, now.wrist, now.object_acc)
     size = lanewise(_largest, new)
 
     def link(i: Any, largest: Lanes) -> Lanes:
@@ -441,7 +454,7 @@ def semi_implicit_euler(
         return x
 
     jax.lax.fori_loop(0, layout.links, store, jnp.int32(0))
-    friction_memory.store(step, good)
+    friction_memory.store(step, assembly.contacts, good)
     return jnp.where(goes_on, largest, speed), good
 
 

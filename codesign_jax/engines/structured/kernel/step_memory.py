@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from codesign_jax.engines.structured.kernel.contact_list import ContactLayout, ContactList
+from codesign_jax.engines.structured.kernel.contact_list import ContactLayout
 from codesign_jax.engines.structured.kernel.memory import Block, BoundTable, MemoryLayout
 from codesign_jax.engines.structured.kernel.rows import (
     FingerState,
@@ -15,7 +15,6 @@ from codesign_jax.engines.structured.kernel.rows import (
     World,
     WorldOptions,
 )
-from codesign_jax.engines.structured.kernel.sides import Sides
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws.cones import friction_by_contact
 from codesign_jax.engines.structured.laws.rings import grown, growth_factors
@@ -133,11 +132,6 @@ class StepMemory:
       block: The lanes.
       grid: Distances of all meshes, a reference; None without meshes.
       like: Zeros of the lanes' shape and type.
-      contacts: The contact lists, by pair of bodies.
-      self_contacts: That of the hand with itself; None without.
-      sides: The bodies that these are between; None without.
-      field_contacts: The other lists, whose contacts have a fixed place.
-      columns: Columns of the object's orientation, once they are known.
     """
 
     def __init__(self, layout: KernelLayout, block: Block, references: References):
@@ -153,30 +147,6 @@ class StepMemory:
         onchip = references.onchip
         self.onchip = None if onchip is None else BoundTable(layout.onchip, onchip)
         self.like = jnp.zeros((layout.size,), references.finger_state.dtype)
-        self.contacts: dict[str, ContactList] = {}
-        self.self_contacts: ContactList | None = None
-        self.sides: Sides | None = None
-        self.field_contacts: list[ContactList] = []
-        self.columns: Lanes | None = None
-
-    def bind_contacts(self) -> None:
-        """Begins a step's contacts: the lists in memory, which is empty."""
-        layout = self.layout
-        bound = {c.name: c.bind(self.scratch, self.block, self.constant) for c in layout.lists}
-        self.contacts = bound
-        self.field_contacts = [c for c in bound.values() if not c.layout.of_hand]
-        if layout.self_list is not None:
-            self.self_contacts = bound[layout.self_list.name]
-            gathers = layout.self_list.slots.gathers
-            self.sides = Sides(self.scratch, self.block, layout.links + 1, gathers=gathers)
-
-    def end_search(self) -> None:
-        """Counts the contacts of the hand with itself, when all are found."""
-        if self.self_contacts is None or self.sides is None:
-            return
-        self.self_contacts = self.self_contacts.counted()
-        self.contacts[self.self_contacts.layout.name] = self.self_contacts
-        self.sides.list_bodies(self.self_contacts)
 
     def _table(self, name: str) -> BoundTable:
         tables = self.hand, self.finger_state, self.scratch, self.onchip

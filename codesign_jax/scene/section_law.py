@@ -372,8 +372,10 @@ def at_joint(
     moments = {name: getattr(held, name) for name in angles}
     springs = {"lateral": held.sideways, "twist": held.torsion}
     more = dict.fromkeys(angles, none)
-    for name in springs.keys() & angles.keys():
-        more[name] = numpy.maximum(springs[name] / segment - rest[name], 0.0)
+    # In a fixed order, which that of a set is not: so that each process writes the same kernel.
+    for name, spring in springs.items():
+        if name in angles:
+            more[name] = numpy.maximum(spring / segment - rest[name], 0.0)
     return moments, more
 
 

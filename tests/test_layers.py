@@ -229,6 +229,31 @@ def test_assignments_stand_one_a_line():
     assert list(parallel(ast.parse("a, b, c = 1, 2, 3\na, b = b, a"))) == [1]
 
 
+# Methods that are parts of a constructor
+CONSTRUCTORS = {"__init__", "by_item", "_tables"}
+
+
+def assigned_later(tree):
+    """Attributes that a class's methods assign once its objects are made, by line."""
+    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    methods = [m for c in classes for m in c.body if isinstance(m, ast.FunctionDef)]
+    for method in methods:
+        if method.name not in CONSTRUCTORS:
+            for node in ast.walk(method):
+                if isinstance(node, ast.Attribute) and not isinstance(node.ctx, ast.Load):
+                    yield f"{node.lineno}: {method.name} assigns {ast.unparse(node)}"
+
+
+def test_the_structured_engine_hands_values_on():
+    """What a part of a step makes is returned, not set because another part reads it later."""
+    later = []
+    for path in sorted((ROOT / ENGINE.replace(".", "/")).rglob("*.py")):
+        later += [f"{path.name}:{line}" for line in assigned_later(parse(path))]
+    assert not later, "\n".join(later)
+    source = "class A:\n  def __init__(self):\n    self.x = 1\n  def f(self):\n    self.x = 2"
+    assert [*assigned_later(ast.parse(source))] == ["5: f assigns self.x"]
+
+
 # Words that say nothing of a value.
 RIDDLES = {"found", "own", "one", "how"}
 

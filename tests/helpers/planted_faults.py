@@ -25,7 +25,7 @@ from codesign_jax.engines.structured.world_model import world_constants
 FAR = 1e30
 DEEP = 1e6
 """Depth of the object [m] that no world reaches; beyond it the bound tells a world's fault."""
-NAMES = "chambers contact_list coupling self_collision sides friction_memory"
+NAMES = "chambers contact_list coupling self_collision finger_shapes sides friction_memory"
 NAMES += " linear_system newton problem ring_pairs sdf_collision placement step"
 MODULES = [import_module(f"{step.__package__}.{name}") for name in NAMES.split()]
 

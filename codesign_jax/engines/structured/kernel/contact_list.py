@@ -226,7 +226,9 @@ class ContactList:
         if not self.layout.of_hand:
             return self.layout.places.fold(self.cells, body, start)
         rows = self.layout.slots.rows
-        return loop(rows, lambda row, carry: self.fold_row(row, body, carry), start, self.size)
+        return loop(
+            rows, lambda slot_row, carry: self.fold_row(slot_row, body, carry), start, self.size
+        )
 
     def each(self, body: Callable[[Item], None]) -> None:
         """Runs body(item), which stores something, for all items."""
@@ -237,16 +239,18 @@ class ContactList:
 
         self.fold(step, [])
 
-    def fold_row(self, row: Any, body: Callable, start: Any) -> Any:
+    def fold_row(self, slot_row: Any, body: Callable, start: Any) -> Any:
         """`fold` over a row of slots; items have their row's pairing and their cone."""
-        pairing = self.pairing(row)
+        pairing = self.pairing(slot_row)
         mixed = self.layout.with_itself and touches_itself(self.layout.scene)
 
         def slot(item: Item, carry: Any) -> Any:
             other = self.read(Slot.other_side, item).lane if mixed else None
-            return body(item._replace(pairing=pairing, cone=self.cone_of_row(row, other)), carry)
+            return body(
+                item._replace(pairing=pairing, cone=self.cone_of_row(slot_row, other)), carry
+            )
 
-        return self.layout.slots.fold_row(self.cells, row, slot, start)
+        return self.layout.slots.fold_row(self.cells, slot_row, slot, start)
 
     def masked(self, busy: jax.Array) -> "ContactList":
         """The list whose passes go through the slots that the lanes `busy` have filled.
@@ -484,33 +488,46 @@ class ContactList:
 
     # Slots, as contacts are found
 
-    def clear(self, row: Any) -> None:
+    def clear(self, slot_row: Any) -> None:
         """Empties a row of slots."""
-        self.layout.slots.clear(self.cells, row)
+        self.layout.slots.clear(self.cells, slot_row)
 
-    def append(self, row: Any, which: jax.Array, fields: dict[str, Lanes]) -> None:
-        """Gives contacts, with what is kept of them, a slot of a row on the lanes `which`."""
-        self.layout.slots.append(self.cells, row, which, fields)
+    def append(self, slot_row: Any, which: jax.Array, fields: dict[str, Lanes]) -> None:
+        """Gives contacts a slot of a row.
+
+        Args:
+          slot_row: The row, a scalar.
+          which: Lanes that have found one, bool, shape (lane,).
+          fields: What is kept of them, by field, (component, 1, ...).
+        """
+        self.layout.slots.append(self.cells, slot_row, which, fields)
 
     def enter(
-        self, row: Any, which: jax.Array, owner: jax.Array, mine: dict, other: dict, alike: dict
+        self,
+        slot_row: Any,
+        which: jax.Array,
+        owner: jax.Array,
+        mine: dict,
+        other: dict,
+        alike: dict,
     ) -> None:
         """Gives contacts of two fingers a slot on both of their lanes.
 
         Args:
+          slot_row: The row of slots of the fingers' pairing, a scalar.
           which: Lanes that have found a contact, a part of `owner`, of which each pair of lanes has
             one.
           mine: What the finder keeps, by field; `other`: its partner; `alike`: each of its own
             side.
         """
         share = lanewise(_only_where, lanes([which], (), wide=True), other[Contact.share])
-        theirs = self.pairing(row).swap(other | {Contact.share: share})
+        theirs = self.pairing(slot_row).swap(other | {Contact.share: share})
         side = lanes([owner], (), wide=True)
         fields = {
             field: lanewise(jnp.where, side, value, theirs[field]) for field, value in mine.items()
         }
         touch = which | (~owner & (fields[Contact.share].lane > 0))
-        self.append(row, touch, fields | alike)
+        self.append(slot_row, touch, fields | alike)
 
     def remembered(self, numbers: dict[str, Any]) -> dict[str, Lanes]:
         """Fields of the numbers, the same or different on the lanes, that the list remembers."""
@@ -539,17 +556,17 @@ class ContactList:
 
     # Slots, when all are found
 
-    def pairing(self, row: Any) -> FingerPairing:
-        """The pairs of fingers whose contacts are in a row of slots."""
-        number = row + self.layout.first
+    def pairing(self, slot_row: Any) -> FingerPairing:
+        """The pairs of fingers whose contacts are in a row of slots, a scalar."""
+        number = slot_row + self.layout.first
         with_itself = self.layout.with_itself
         return FingerPairing(self.block, number, self.like.dtype, with_itself=with_itself)
 
-    def cone_of_row(self, row: Any, other: Any = None) -> Cone:
+    def cone_of_row(self, slot_row: Any, other: Any = None) -> Cone:
         """The cone of a row's contacts; other: second sides, of which 0 is the palm."""
         if len(self.cones) == 1:
             return next(iter(self.cones.values()))
-        palm = jnp.full((self.size,), jnp.equal(row, 0))
+        palm = jnp.full((self.size,), jnp.equal(slot_row, 0))
         if other is not None:
             palm &= other < 0.5
         here = lanes([palm], (), wide=other is not None)
@@ -577,8 +594,8 @@ class ContactList:
         """Whether any slot is in use, a scalar."""
         slots = self.layout.slots
 
-        def most(row: Any, count: jax.Array) -> jax.Array:
-            return jnp.maximum(count, slots.used(self.cells, row))
+        def most(slot_row: Any, count: jax.Array) -> jax.Array:
+            return jnp.maximum(count, slots.used(self.cells, slot_row))
 
         return jax.lax.fori_loop(0, slots.rows, most, jnp.int32(0)) > 0
 

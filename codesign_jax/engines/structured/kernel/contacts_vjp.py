@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from codesign_jax.engines.structured.kernel import friction_memory, kinds, objects
 from codesign_jax.engines.structured.kernel.contact_list import ContactList
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, only_on, plus, pull
+from codesign_jax.engines.structured.kernel.finger_shapes import neighbours
 from codesign_jax.engines.structured.kernel.kinds import KINDS, BodyMotion, CentreLine
 from codesign_jax.engines.structured.kernel.memory import any_of, zeros
 from codesign_jax.engines.structured.kernel.pairing import FingerPairing
@@ -32,7 +33,6 @@ from codesign_jax.engines.structured.kernel.rows import (
     StepBar,
     World,
 )
-from codesign_jax.engines.structured.kernel.self_collision import neighbours
 from codesign_jax.engines.structured.kernel.step import Assembly, Step
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import shapes, surroundings
@@ -57,12 +57,20 @@ class ContactsVjp:
         virtual: Iterate,
         bars: CotangentTables,
     ):
+        """Prepares the pass.
+
+        Args:
+          step: The step's memory.
+          assembly: What `Step.assemble` returns.
+          virtual: Virtual accelerations of the wrist, of palm and object.
+          bars: The tables of cotangents.
+        """
         bodies = assembly.bodies
         world_object = assembly.world_object
         self.step = step
         self.layout = step.layout
         self.contacts = assembly.contacts
-        self.search = assembly.search
+        self.fingers = assembly.fingers
         self.world_object = world_object
         self.bars = bars
         self.scratch = step.scratch
@@ -329,8 +337,8 @@ class ContactsVjp:
         last = jnp.where(link == self.layout.links, self.like + 1.0, self.like)
         end: Any = 1
         if itself:
-            assert self.search is not None
-            end = self.search.last_of(jax.lax.rem(remembered, self._count), link)
+            assert self.fingers is not None
+            end = self.fingers.last_of(jax.lax.rem(remembered, self._count), link)
         fixed = {"last": self._float(last), "end": self._float(end)}
         lane = self.lane if itself else pairing.lane
 
@@ -378,9 +386,9 @@ class ContactsVjp:
 
     def _sections(self, row: jax.Array) -> list[jax.Array]:
         """Rings whose sections segments have, and the one before has; see `ring_at`."""
-        assert self.search is not None
+        assert self.fingers is not None
         places = (1, 0) if self.layout.tapered else (1,)
-        return [jnp.zeros_like(row) + self.search.ring_at(row + k) for k in places]
+        return [jnp.zeros_like(row) + self.fingers.ring_at(row + k) for k in places]
 
     @property
     def _count(self) -> jax.Array:

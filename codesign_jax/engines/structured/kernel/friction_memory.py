@@ -41,6 +41,7 @@ BETWEEN_FINGERS = "held.finger_finger"
 
 
 def any_held(problem: Problem) -> bool:
+    """Whether any contact of the scene holds friction."""
     return bool(problem.memory.layout.held)
 
 
@@ -49,11 +50,11 @@ def pairings(step: StepMemory) -> int:
     return step.layout.held.get("finger_finger", 0)
 
 
-def held_by_pairing(step: StepMemory, self_contacts: ContactList, row: Any) -> list[Lanes]:
+def held_by_pairing(step: StepMemory, self_contacts: ContactList, slot_row: Any) -> list[Lanes]:
     """What the fingers of a pairing's row hold, (3,) or nothing if the scene has no such state."""
     if not pairings(step):
         return []
-    return [step.finger_state.read(BETWEEN_FINGERS, row + self_contacts.layout.first)]
+    return [step.finger_state.read(BETWEEN_FINGERS, slot_row + self_contacts.layout.first)]
 
 
 def held_by_item(
@@ -135,8 +136,15 @@ def _store(step: StepMemory, contacts: ContactList, mask: Lanes) -> None:
     jax.lax.fori_loop(0, step.layout.held[contacts.layout.name] // k, store_item, jnp.int32(0))
 
 
-def sums(self_contacts: ContactList, row: Any, alpha: Lanes, held_friction: Lanes) -> Lanes:
-    """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar."""
+def sums(self_contacts: ContactList, slot_row: Any, alpha: Lanes, held_friction: Lanes) -> Lanes:
+    """Sums of `holding.hold`, (4,), of a row's contacts where the last step has moved jar.
+
+    Args:
+      self_contacts: The hand's contacts with itself.
+      slot_row: The row of slots, a scalar.
+      alpha: Length of Newton's last step.
+      held_friction: What the row's fingers hold before the step, (3,).
+    """
 
     def add(sums, place, cone, alpha, jar, step, held_friction, counts):
         c = make_contacts(place, cone)
@@ -150,12 +158,18 @@ def sums(self_contacts: ContactList, row: Any, alpha: Lanes, held_friction: Lane
         contact_numbers = self_contacts.place(item), self_contacts.cone_at(item)
         return lanewise(add, sums, *contact_numbers, alpha, jar, step, held_friction, counts)
 
-    added = self_contacts.fold_row(row, slot, zeros((4,), self_contacts.like))
+    added = self_contacts.fold_row(slot_row, slot, zeros((4,), self_contacts.like))
     return added if self_contacts.block.team == 1 else team_sum(self_contacts.block, added)
 
 
 def keep(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
-    """Keeps what contacts of worlds hold whose iteration ends with a step of this length."""
+    """Keeps what contacts of worlds hold whose iteration ends with a step of this length.
+
+    Args:
+      problem: The solver's problem.
+      alpha: Length of Newton's last step.
+      which: Lanes of these worlds, bool, shape (lane,).
+    """
     some = [c for c in (*problem.per_link, *problem.dealt) if c.layout.holds]
 
     def keep_all() -> None:
@@ -220,11 +234,13 @@ def _keep_of_fingers(problem: Problem, alpha: Lanes, which: jax.Array) -> None:
         mask = lanes([which], (), wide=True)
         first = self_contacts.layout.first
 
-        def keep_row(row: jax.Array, x: jax.Array) -> jax.Array:
-            before, old = problem.read(BETWEEN_FINGERS, Scratch.new_held_friction, item=row + first)
-            new = lanewise(holding.quotient, sums(among, row, alpha, before))
+        def keep_row(slot_row: jax.Array, x: jax.Array) -> jax.Array:
+            before, old = problem.read(
+                BETWEEN_FINGERS, Scratch.new_held_friction, item=slot_row + first
+            )
+            new = lanewise(holding.quotient, sums(among, slot_row, alpha, before))
             problem.write(
-                Scratch.new_held_friction, lanewise(jnp.where, mask, new, old), row + first
+                Scratch.new_held_friction, lanewise(jnp.where, mask, new, old), slot_row + first
             )
             return x
 
@@ -326,12 +342,14 @@ def _reverse_fingers(
     no_step = zeros((), step.like)
 
     for item in range(pairings(step)):
-        row = item - self_contacts.layout.first
+        slot_row = item - self_contacts.layout.first
         mine = state.read(BETWEEN_FINGERS, item)
         sums_bar = zeros((4,), step.like)
-        if 0 <= row < self_contacts.layout.slots.rows:
-            ended = sums(self_contacts, row, no_step, step.finger_state.read(BETWEEN_FINGERS, item))
-            theirs = self_contacts.pairing(row).swap(mine)
+        if 0 <= slot_row < self_contacts.layout.slots.rows:
+            ended = sums(
+                self_contacts, slot_row, no_step, step.finger_state.read(BETWEEN_FINGERS, item)
+            )
+            theirs = self_contacts.pairing(slot_row).swap(mine)
             both = lanewise(jnp.subtract, mine, theirs) if item else mine
             (sums_bar,) = pull(holding.quotient, (ended,), (), only_on(go, both))
         step.scratch.write(Virtual.sums_bar, sums_bar, item)

@@ -253,6 +253,16 @@ def loop(count: int, body: Callable, start: Any, size: int, *, reverse: bool = F
     return rebuild(jax.lax.fori_loop(0, count, step, first))
 
 
+def each(count: int, body: Callable[[Any], None]) -> None:
+    """Runs body(item), which stores something, for all items; item: int32, a scalar."""
+
+    def step(k: jax.Array, x: jax.Array) -> jax.Array:
+        body(k)
+        return x
+
+    jax.lax.fori_loop(0, count, step, jnp.int32(0))
+
+
 def upper(matrix: Lanes) -> Lanes:
     """Upper triangle of a symmetric (n, n) matrix, n (n + 1) / 2 components."""
     n = matrix.shape[0]

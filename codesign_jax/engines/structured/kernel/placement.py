@@ -71,12 +71,12 @@ class SlotCounts:
         """The numbers of the lanes of a mask, zero on others."""
         return SlotCounts([jnp.where(chosen, word, 0) for word in self.words], self._most)
 
-    def of(self, row: jax.typing.ArrayLike) -> jax.Array:
-        """A row's numbers, shape (lane,); `row` is a scalar."""
-        row = jnp.asarray(row, jnp.int32)
+    def of(self, slot_row: jax.typing.ArrayLike) -> jax.Array:
+        """Numbers of a row of slots, shape (lane,); slot_row: the row's number, a scalar."""
+        slot_row = jnp.asarray(slot_row, jnp.int32)
         each = jnp.int32(self._each)
-        which = jax.lax.div(row, each)
-        place = jax.lax.rem(row, each)
+        which = jax.lax.div(slot_row, each)
+        place = jax.lax.rem(slot_row, each)
         word = self.words[0]
         for k, other in enumerate(self.words[1:], 1):
             word = jnp.where(which == k, other, word)
@@ -211,23 +211,25 @@ class Appended:
         """Item that lanes read in slots that are not theirs; None where all read their own."""
         return self.items - 1 if self.gathers else None
 
-    def first(self, row: Any) -> Any:
+    def first(self, slot_row: Any) -> Any:
         """Item of a row's first slot."""
-        return row * (self.slots + 1)
+        return slot_row * (self.slots + 1)
 
     # As contacts are found
 
-    def clear(self, cells: Cells, row: Any) -> None:
+    def clear(self, cells: Cells, slot_row: Any) -> None:
         """Empties a row."""
-        cells.write(SlotCount.count, zeros((), cells.like), at(row))
+        cells.write(SlotCount.count, zeros((), cells.like), at(slot_row))
 
-    def append(self, cells: Cells, row: Any, which: jax.Array, fields: dict[str, Lanes]) -> None:
+    def append(
+        self, cells: Cells, slot_row: Any, which: jax.Array, fields: dict[str, Lanes]
+    ) -> None:
         """Gives contacts, with what is kept of them, a slot of a row on the lanes `which`.
 
         Lanes of a team append in their order.
         """
-        count = cells.read(SlotCount.count, at(row)).lane
-        first = self.first(row)
+        count = cells.read(SlotCount.count, at(slot_row)).lane
+        first = self.first(slot_row)
         filled = count.astype(jnp.int32)
         if self.shared:
             rank, number = ranks(cells.block, which)
@@ -248,7 +250,7 @@ class Appended:
             more = count + number.astype(count.dtype)
         else:
             more = jnp.where(which, count + 1.0, count)
-        cells.write(SlotCount.count, lanes([more], (), wide=True), at(row))
+        cells.write(SlotCount.count, lanes([more], (), wide=True), at(slot_row))
 
     def _fill(self, cells: Cells, first: Any, slot: jax.Array, fields: dict[str, Lanes]) -> None:
         """Stores the lanes' contacts, one slot after the other: vectors scatter slowly.
@@ -275,7 +277,8 @@ class Appended:
         """The memory with the numbers of filled slots in registers, when all are found."""
         most = self.slots
         counts = [
-            cells.read(SlotCount.count, at(row)).lane.astype(jnp.int32) for row in range(self.rows)
+            cells.read(SlotCount.count, at(slot_row)).lane.astype(jnp.int32)
+            for slot_row in range(self.rows)
         ]
         filled = SlotCounts.of_rows([jnp.minimum(n, most) for n in counts], most)
         return cells._replace(filled=filled)
@@ -283,53 +286,53 @@ class Appended:
     def overflow(self, cells: Cells) -> jax.Array:
         """One for lanes that had too few slots in any row, else zero, shape (lane,)."""
 
-        def worst(row: jax.Array, most: jax.Array) -> jax.Array:
-            return jnp.maximum(most, cells.read(SlotCount.count, at(row)).lane)
+        def worst(slot_row: jax.Array, most: jax.Array) -> jax.Array:
+            return jnp.maximum(most, cells.read(SlotCount.count, at(slot_row)).lane)
 
         most = jax.lax.fori_loop(0, self.rows, worst, cells.like)
         return jnp.where(most > self.slots, 1.0, 0.0).astype(cells.like.dtype)
 
     # When all are found
 
-    def used(self, cells: Cells, row: Any) -> jax.Array:
+    def used(self, cells: Cells, slot_row: Any) -> jax.Array:
         """Largest number of slots that a lane has filled, or of rounds of a team, a scalar."""
         assert cells.filled is not None
-        most = jnp.max(cells.filled.of(row))
+        most = jnp.max(cells.filled.of(slot_row))
         if not self.shared:
             return most
         team = cells.block.team
         return jax.lax.div(most + (team - 1), jnp.int32(team))
 
-    def fold_row(self, cells: Cells, row: Any, body: Callable, start: Any) -> Any:
+    def fold_row(self, cells: Cells, slot_row: Any, body: Callable, start: Any) -> Any:
         """Folds body(item, tree of lanes) over a row's slots in use."""
-        used = self.used(cells, row)
-        first = self.first(row)
+        used = self.used(cells, slot_row)
+        first = self.first(slot_row)
         size = cells.block.size
         arrays, rebuild = solid(start, size)
 
         def step(carry: list) -> list:
-            item = self._item(cells, row, first, carry[0])
+            item = self._item(cells, slot_row, first, carry[0])
             return [carry[0] + 1, *solid(body(item, rebuild(carry[1:])), size)[0]]
 
         return rebuild(jax.lax.while_loop(lambda c: c[0] < used, step, [jnp.int32(0), *arrays])[1:])
 
-    def _item(self, cells: Cells, row: Any, first: Any, k: jax.Array) -> Item:
+    def _item(self, cells: Cells, slot_row: Any, first: Any, k: jax.Array) -> Item:
         """A row's k-th slot, or the lanes' slots in round k."""
         if not self.gathers:
             return Item(first + k, first + k)
         if self.shared:
-            return self.slot(cells, row, k * cells.block.team + cells.block.mate)
-        return self.slot(cells, row, k)
+            return self.slot(cells, slot_row, k * cells.block.team + cells.block.mate)
+        return self.slot(cells, slot_row, k)
 
-    def slot(self, cells: Cells, row: Any, number: jax.Array) -> Item:
+    def slot(self, cells: Cells, slot_row: Any, number: jax.Array) -> Item:
         """A row's slot of a number, where lanes gather: of the lanes that have filled it.
 
         Args:
           number: The number, a scalar or int32 of shape (lane,).
         """
         assert cells.filled is not None
-        mine = number < cells.filled.of(row)
-        item = jnp.broadcast_to(self.first(row) + number, mine.shape)
+        mine = number < cells.filled.of(slot_row)
+        item = jnp.broadcast_to(self.first(slot_row) + number, mine.shape)
         spare = self.slots  # that of the first row
         source, sink = (jnp.where(mine, item, jnp.int32(k)) for k in (self.items - 1, spare))
         return Item(source, sink)

@@ -6,7 +6,6 @@ of each ring on the object beside its place.  Jar is the one at the end of the s
 iteration ends, `settle` adds the last step of Newton's method to it, and a chord step behind that.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ from codesign_jax.engines.structured.kernel.contact_list import (
     force_of_jar,
     make_contacts,
 )
-from codesign_jax.engines.structured.kernel.memory import BoundTable, choose, zeros
+from codesign_jax.engines.structured.kernel.memory import BoundTable, choose, each, zeros
 from codesign_jax.engines.structured.kernel.placement import Item
 from codesign_jax.engines.structured.kernel.problem import Iterate, Problem, relative
 from codesign_jax.engines.structured.kernel.rows import (
@@ -101,7 +100,7 @@ def settle(problem: Problem, alpha: Lanes, ends: jax.Array, chord: Iterate) -> N
 
         self_contacts.masked(ends).each(settle_slot)
     if Scratch.chord_link_acc in step.scratch:
-        _each(problem.links, lambda i: step.scratch.write(
+        each(problem.links, lambda i: step.scratch.write(
             Scratch.chord_link_acc, zeros((6,), step.like), i
         ))  # fmt: skip
 
@@ -126,7 +125,7 @@ def write(step: StepMemory, step_contacts: StepContacts, table: BoundTable) -> N
     for contacts in step_contacts.field_contacts.values():
         _write_list(step, contacts, step_contacts.columns, table)
     if (pairs := step_contacts.self_contacts) is not None:
-        _each(pairs.layout.slots.rows, lambda row: _write_pairing(step, pairs, row, table))
+        each(pairs.layout.slots.rows, lambda slot_row: _write_pairing(step, pairs, slot_row, table))
 
 
 def _write_list(step: StepMemory, contacts: ContactList, columns: Lanes, table: BoundTable) -> None:
@@ -172,10 +171,12 @@ def _write_rings(step: StepMemory, contacts: ContactList, table: BoundTable) -> 
     contacts.each(put)
 
 
-def _write_pairing(step: StepMemory, contacts: ContactList, row: Any, table: BoundTable) -> None:
+def _write_pairing(
+    step: StepMemory, contacts: ContactList, slot_row: Any, table: BoundTable
+) -> None:
     """Writes what the fingers of a pairing do to one another, to themselves and to the palm."""
     energy = f"{SELF}.{PairForce.energy}" in table
-    hold = friction_memory.held_by_pairing(step, contacts, row) if energy else []
+    hold = friction_memory.held_by_pairing(step, contacts, slot_row) if energy else []
 
     def add(item: Item, sums: list[Lanes]) -> list[Lanes]:
         itself = item.pairing.itself
@@ -189,28 +190,18 @@ def _write_pairing(step: StepMemory, contacts: ContactList, row: Any, table: Bou
         return lanewise(_add_slot, sums, side, *numbers, *held)
 
     none = [zeros((2,), step.like)] * (2 + energy)
-    pressing, depth, *stored = contacts.fold_row(row, add, none)
+    pressing, depth, *stored = contacts.fold_row(slot_row, add, none)
     if contacts.layout.placement.shared:
         pressing = team_sum(step.block, pressing)
         depth = _most_of_team(step, depth)
     fields = [PairForce.pressing, PairForce.depth, PairForce.energy]
     for field, value in zip(fields, (pressing, depth, *stored), strict=False):
-        table.write(f"{SELF}.{field}", value, row)
+        table.write(f"{SELF}.{field}", value, slot_row)
 
 
 def _most_of_team(step: StepMemory, value: Lanes) -> Lanes:
     parts = [step.block.over_team(p, jnp.maximum) for p in value.parts.ravel()]
     return lanes(parts, value.shape[:-2], wide=True)
-
-
-def _each(count: int, body: Callable[[Any], None]) -> None:
-    """Runs body(k), which stores something, for all k below a number."""
-
-    def run(k: jax.Array, x: jax.Array) -> jax.Array:
-        body(k)
-        return x
-
-    jax.lax.fori_loop(0, count, run, jnp.int32(0))
 
 
 # Stages that the kernel evaluates lane by lane

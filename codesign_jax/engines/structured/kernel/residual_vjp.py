@@ -38,6 +38,13 @@ class ResidualVjp:
         assembly: Assembly,
         bars: CotangentTables,
     ):
+        """Prepares the sweep.
+
+        Args:
+          step: The step's memory, with its virtual accelerations.
+          assembly: What `Step.assemble` returns.
+          bars: The tables of cotangents.
+        """
         self.step = step
         self.layout = step.layout
         self.bodies = assembly.bodies
@@ -72,6 +79,7 @@ class ResidualVjp:
         return self._mount(base, centre_bar), wrist
 
     def none(self, name: str) -> Lanes:
+        """A cotangent of zero of a field of `LinkMotion`."""
         return zeros(getattr(SHAPES, name), self.like)
 
     def with_contacts(self, bars: LinkMotion, row: Any) -> LinkMotion:

@@ -27,25 +27,29 @@ class RingPairs:
     """The search of one pairing's contacts.
 
     Attributes:
+      search: The `SelfCollision` that begins it; `fingers`, `contacts`: as there.
+      slot_row: The pairing's row of slots, a scalar.
       first: Lanes of fingers whose rings look, bool, shape (lane,).
       second: Lanes of the fingers that they look at.
     """
 
-    def __init__(self, search: Any, row: jax.Array, pairing: FingerPairing, first: jax.Array):
+    def __init__(self, search: Any, slot_row: jax.Array, pairing: FingerPairing, first: jax.Array):
         """Begins the search of a row of slots; search: the `SelfCollision` that begins it."""
+        fingers = search.fingers
         self.search = search
+        self.fingers = fingers
         self.contacts = search.contacts
-        self.row = row
+        self.slot_row = slot_row
         self.pairing = pairing
         self.first = first
         number = jnp.where(first, jnp.int32(1), jnp.int32(0))
         self.second = pairing.swap(lanes([number], (), wide=True)).lane > 0
-        mine = search.read(Search.fastest)
-        reach = search.reach(search.largest())
+        mine = fingers.read(Search.fastest)
+        reach = fingers.reach(fingers.largest())
         self.their_reach = self._second_finger(reach)
         their_speed = self._second_finger(mine)
         self.speed = lanewise(jnp.add, self.mixed(mine, mine), their_speed)
-        most = lanewise(jnp.maximum, reach, search.reach(search.ring(0)))
+        most = lanewise(jnp.maximum, reach, fingers.reach(fingers.ring(0)))
         reaches = self.mixed(most, most), self.their_reach
         gap = lanes([search.gap(self.speed)], (), wide=True)
         self.far = lanewise(lambda a, b, c: a + b + c + SAFE, *reaches, gap)
@@ -61,15 +65,16 @@ class RingPairs:
     def find(self) -> None:
         """Gives a slot to each contact."""
         search = self.search
+        fingers = self.fingers
 
         def copy(i: Any, nothing: list) -> list:
-            search.write(Search.other, self._second_finger(search.read(Search.line, i)), i)
+            fingers.write(Search.other, self._second_finger(fingers.read(Search.line, i)), i)
             return nothing
 
         size = search.block.size
         loop(search.layout.links + 1, copy, [], size)
         start = zeros((3,), search.like), zeros((), search.like)
-        loop(-(-search.count // 2), lambda k, seen: self._look(2 * k, *seen), start, size)
+        loop(-(-fingers.count // 2), lambda k, seen: self._look(2 * k, *seen), start, size)
 
     def _look(self, item: jax.Array, seen: Lanes, free: Lanes) -> tuple[Lanes, Lanes]:
         """Looks with a ring and the one behind it, unless both are surely far.
@@ -86,10 +91,11 @@ class RingPairs:
           `seen` and `free` for the next rings.
         """
         search = self.search
-        following = jnp.minimum(item + 1, search.count - 1)
-        looks = self.first | (self.second & (item + 1 < search.count))
-        first = search.body(item)
-        second = search.body(following)
+        fingers = self.fingers
+        following = jnp.minimum(item + 1, fingers.count - 1)
+        looks = self.first | (self.second & (item + 1 < fingers.count))
+        first = fingers.body(item)
+        second = fingers.body(following)
         centre = self.mixed(first[3], second[3])
         away = lanewise(moved_square, centre, seen).lane
         sure = (free.lane > 0) & (away < free.lane * free.lane)
@@ -107,11 +113,12 @@ class RingPairs:
 
         Args:
           items: The rings that the lanes `first` and `second` look with.
-          first: The first ring's body, `second`: the other's, see `SelfCollision.body`.
+          first: The first ring's body, `second`: the other's, see `FingerShapes.body`.
           centre: The lanes' ring's centre; `looks`: lanes that have a ring.
         """
         search = self.search
-        reach = self.mixed(search.reach(first[1]), search.reach(second[1]))
+        fingers = self.fingers
+        reach = self.mixed(fingers.reach(first[1]), fingers.reach(second[1]))
         square, other, t = search.nearest(Search.other, centre)
         near = looks & search.near(square, reach, self.their_reach, self.speed)
 
@@ -119,14 +126,14 @@ class RingPairs:
             numbers = self.mixed(first[1], second[1])
             frame = self.mixed(first[2], second[2])
             segment, moves = self._segment(other, near)
-            faced = search.facing(numbers, frame, centre, segment, other, t)
+            faced = fingers.facing(numbers, frame, centre, segment, other, t)
 
             def add(close: jax.Array) -> None:
                 place = search.place(numbers, frame, centre, faced)
-                mine = self.mixed(search.moves(first[0]), search.moves(second[0]))
-                held = friction_memory.held_by_pairing(search.step, self.contacts, self.row)
+                mine = self.mixed(fingers.moves(first[0]), fingers.moves(second[0]))
+                held = friction_memory.held_by_pairing(search.step, self.contacts, self.slot_row)
                 held = self.mixed(held, held)
-                cone = self.contacts.cone_of_row(self.row)
+                cone = self.contacts.cone_of_row(self.slot_row)
                 link = jnp.where(self.first, first[0], second[0])
                 candidate = search.candidate(place, cone, link, mine, moves, held)
                 self._enter(candidate, other, close, items)
@@ -139,8 +146,9 @@ class RingPairs:
     def _segment(self, row: jax.Array, near: jax.Array) -> Any:
         """Segments of the second finger and their links' moves on both lanes of the pairs."""
         search = self.search
-        theirs = search.of_rows(search.segment, row, near & self.first, self.pairing)
-        same = search.of_rows(search.segment, row, near & self.second, None)
+        fingers = self.fingers
+        theirs = search.of_rows(fingers.segment, row, near & self.first, self.pairing)
+        same = search.of_rows(fingers.segment, row, near & self.second, None)
         return where(self.first, theirs, same)
 
     def _enter(self, contact: dict[str, Lanes], other: Any, close: jax.Array, items: tuple) -> None:
@@ -151,7 +159,7 @@ class RingPairs:
           other: The second finger's links.
           items: The rings that the lanes `first` and `second` have looked with.
         """
-        enter = partial(self.search.enter, self.row)
+        enter = partial(self.search.enter, self.slot_row)
         enter(close & self.first, self.first, contact, other, items[0])
         enter(close & self.second, self.first, contact, other, items[1], self.second)
 

@@ -249,7 +249,7 @@ class Air(Rows):
 
 
 class Search(Rows, prefix="pair"):
-    """Where the fingers are, for the lanes of the others; see `self_collision`."""
+    """Where the fingers are, for the lanes of the others; see `finger_shapes`."""
 
     frame = field(BODY, 3, 3)
     joint = field(BODY, 3)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory, objects
 from codesign_jax.engines.structured.kernel.contact_list import ContactList
+from codesign_jax.engines.structured.kernel.finger_shapes import FingerShapes
 from codesign_jax.engines.structured.kernel.kinds import beside
 from codesign_jax.engines.structured.kernel.memory import any_of, zeros
 from codesign_jax.engines.structured.kernel.objects import WorldObject
@@ -24,7 +25,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     WorldOptions,
     WorldState,
 )
-from codesign_jax.engines.structured.kernel.self_collision import SelfCollision, closed
+from codesign_jax.engines.structured.kernel.self_collision import closed
 from codesign_jax.engines.structured.kernel.step_contacts import StepContacts
 from codesign_jax.engines.structured.kernel.step_memory import StepMemory
 from codesign_jax.engines.structured.lanes import apply_columns, cross, dot, total
@@ -54,6 +55,14 @@ class SdfCollision:
         bodies: dict[str, Any],
         world_object: WorldObject,
     ):
+        """Prepares the search.
+
+        Args:
+          step: The step's memory.
+          contacts: The step's contacts, of which it enters those with fields.
+          bodies: What `step.palm_and_object` returns.
+          world_object: The object of each lane's world.
+        """
         self.step = step
         self.layout = step.layout
         self.bodies = bodies
@@ -88,6 +97,13 @@ class SdfCollision:
         )
 
     def moves(self, name: str, link_acc: Lanes | None, vel: Lanes | None) -> tuple[Lanes, Lanes]:
+        """Relative spatial acceleration and velocity of a pair of bodies, (6, ...) each.
+
+        Args:
+          name: The pair.
+          link_acc: Spatial acceleration of the item's link without velocity terms, (6, ...); `vel`:
+            its spatial velocity, (6, ...). None for pairs without a finger.
+        """
         bodies = self.bodies
         now = self.bodies["now"]
         return (
@@ -112,17 +128,17 @@ class SdfCollision:
                 name, at(i), numbers, frame, centre, self.moves(name, link_acc, vel), hold
             )
 
-    def of_rings(self, search: SelfCollision) -> None:
+    def of_rings(self, fingers: FingerShapes) -> None:
         """Contacts of the fingers' rings, dealt to the lanes of a team."""
         for name in self.names:
             contacts = self.contacts[name]
             contacts.write_empty()
 
             def ring(item: Item, name: str = name, contacts: ContactList = contacts) -> None:
-                row, numbers, frame, centre = search.body(item.number)
+                row, numbers, frame, centre = fingers.body(item.number)
                 numbers, centre = (lanewise(as_item, v) for v in (numbers, centre))
                 moves = self.moves(
-                    name, *(search.side_of(n, row) for n in (Side.link_acc, Side.vel))
+                    name, *(fingers.side_of(n, row) for n in (Side.link_acc, Side.vel))
                 )
                 hold = self.held(contacts, item)
                 self.on_field(name, item, numbers, frame, centre, moves, hold)
@@ -130,6 +146,7 @@ class SdfCollision:
             contacts.each(ring)
 
     def numbers(self, i: Any) -> Lanes:
+        """Numbers of the rings or spheres of link i, (number, k), see `StepMemory.ring`."""
         k = self.layout.rings_per_link
         each = [self.step.ring(i * k + j) for j in range(k)]
         return lanewise(lambda rows: jnp.stack(rows, 1), each)
@@ -144,7 +161,17 @@ class SdfCollision:
         moves: tuple[Lanes, Lanes],
         hold: tuple[Lanes, Lanes] | None,
     ) -> None:
-        """Creates contacts of rings or balls of a body."""
+        """Creates contacts of rings or balls of a body.
+
+        Args:
+          name: The pair of bodies.
+          item: Where the contacts are in their list.
+          numbers: Numbers of the k rings or balls, (number, k).
+          frame: The body's frame as columns, (3, 3, ...).
+          centre: Their centres from the object's [m], (3, k).
+          moves: See `moves`.
+          hold: What the contacts hold of friction, see `held`.
+        """
         contacts = self.contacts[name]
         looks = self.looks(name)
         seen = [look(centre) for look in looks]
@@ -277,4 +304,5 @@ def any_closes(gap, most):
 
 
 def as_item(numbers):
+    """What one ring has, (n, ...), as that of an item of one contact, (n, 1, ...)."""
     return numbers[:, None]

@@ -1,9 +1,9 @@
 """Finds where fingers touch each other, themselves and the palm: rings or spheres.
 
 A ring meets the nearest place of another finger's centre line, or of its own on the way back to the
-palm that is `arc` away along the finger.  Of two fingers the first one's rings look: with both
-fingers' there would be twice as many contacts, which is what a step's time goes to.  The lanes of a
-team, see `shared_memory`, look with a ring each.
+palm that is `finger_shapes.arc` away along the finger.  Of two fingers the first one's rings look:
+with both fingers' there would be twice as many contacts, which is what a step's time goes to.  The
+lanes of a team, see `shared_memory`, look with a ring each.
 """
 
 from collections.abc import Callable
@@ -15,15 +15,14 @@ import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import friction_memory
 from codesign_jax.engines.structured.kernel.contact_list import ContactList, fields_of, with_held
+from codesign_jax.engines.structured.kernel.finger_shapes import FingerShapes
 from codesign_jax.engines.structured.kernel.kinds import (
-    above,
     balls,
-    facing_line,
     palm_distance,
     place_of,
     with_axis,
 )
-from codesign_jax.engines.structured.kernel.memory import BoundTable, any_of, loop, solid, zeros
+from codesign_jax.engines.structured.kernel.memory import any_of, each, loop, solid, zeros
 from codesign_jax.engines.structured.kernel.pairing import FingerPairing
 from codesign_jax.engines.structured.kernel.ring_pairs import RingPairs
 from codesign_jax.engines.structured.kernel.rows import (
@@ -32,162 +31,56 @@ from codesign_jax.engines.structured.kernel.rows import (
     Hand,
     Remembered,
     Search,
-    Side,
     Slot,
     WorldOptions,
 )
-from codesign_jax.engines.structured.kernel.sides import Sides
-from codesign_jax.engines.structured.kernel.step_memory import StepMemory
-from codesign_jax.engines.structured.lanes import apply_columns, cross, dot
+from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise
 from codesign_jax.engines.structured.laws import contact, touch
-from codesign_jax.engines.structured.laws.rings import Facing, Place, Ring
-from codesign_jax.engines.structured.laws.touch import ring_centre
-from codesign_jax.model.layout import (
-    RING_TIP,
-    beyond_base,
-    first_on_palm,
-    ring_places,
-    touches_itself,
-)
+from codesign_jax.engines.structured.laws.rings import Facing, Place
+from codesign_jax.model.layout import beyond_base, first_on_palm, touches_itself
 
 SURELY = 1.0 - 1e-4
 """At a joint two segments have one nearest place, which is the first one's, whatever is rounded."""
-APART_LINKS = 3.0
-"""Least distance along a finger at which it touches itself [links]: the rings of neighbours overlap
-as their joint bends [ours]."""
-APART_HEIGHTS = 1.8
-"""The same in heights of the largest section [ours]: bent by half a turn about its own lower edge a
-finger's centre line is pi/2 = 1.57 heights long, and what is nearer along it does not meet."""
-SURFACE_RADIUS = 4.0
-"""Bound of the distance of a link's surface from its joint, in half heights of its first ring, for
-the speed with which it moves as the link turns [ours]."""
 
 
 class SelfCollision:
-    """Gives a slot to each contact of fingers with one another, with themselves and the palm."""
+    """Gives a slot to each contact of fingers with one another, with themselves and the palm.
 
-    def __init__(
-        self, step: StepMemory, self_contacts: ContactList, sides: Sides, bodies: dict[str, Any]
-    ):
+    Attributes:
+      fingers: Where the fingers are.
+      contacts: The hand's contacts with itself.
+      hull: Whether fingers have rings.
+      palm: The palm's place (3, ...), frame (3, 3, ...) and disc, lanes of a world; None without
+        contacts with it.
+    """
+
+    def __init__(self, fingers: FingerShapes, self_contacts: ContactList, bodies: dict[str, Any]):
+        """Prepares the search; bodies: what `step.palm_and_object` returns."""
+        step = fingers.step
         self.step = step
+        self.fingers = fingers
         self.contacts = self_contacts
-        self.sides = sides
         self.layout = step.layout
-        self.scratch = step.scratch
         self.block = step.block
         self.like = step.like
-        self.count = self.layout.links * self.layout.rings_per_link
-        self.palm_vel = bodies["vel"]
         self.hull = step.layout.scene.effects.surface == "hull"
         self.palm = None
         if step.layout.scene.effects.finger_palm:
             self.palm = bodies["place"], bodies["frame"], step.constant(WorldOptions.palm_disc)
 
-    # Where fingers are
-
-    def write(self, name: Field, value: Lanes, item: Any = 0) -> None:
-        """Stores a field of `rows.Search` of the lanes' own fingers."""
-        self.scratch.write(name, value, item)
-
-    def read(self, name: Field, item: Any = 0, lane: jax.Array | None = None) -> Lanes:
-        """Where the lanes' own fingers are, or those of other lanes; items may be of lanes."""
-        if lane is None and not jnp.ndim(item):
-            return self.scratch.read(name, item)
-        return self._gathered(self.scratch, name, item, lane)
-
-    def _gathered(self, table: BoundTable, name: Field, item: Any, lane: Any) -> Lanes:
-        return table.gather(name, *self._places(item, lane))
-
-    def _places(self, item: Any, lane: Any) -> tuple[jax.Array, jax.Array]:
-        """Items of each lane, and lanes that have them; None for the lanes' own."""
-        item = jnp.zeros_like(self.block.column) + item
-        return item, self.block.column if lane is None else lane
-
-    def ring(self, item: Any, lane: jax.Array | None = None) -> Lanes:
-        if lane is None and not jnp.ndim(item):
-            return self.step.ring(item)
-        return self.step.ring(*self._places(item, lane))
-
-    def ring_at(self, row: Any) -> Any:
-        """The ring whose section a finger has where a segment of its centre line begins.
-
-        All sections are alike but for a tapered finger's: there it is the ring before that place.
-        """
-        if not self.layout.tapered:
-            return self.count - 1
-        first = (jnp.asarray(row) - 1) * self.layout.rings_per_link - 1
-        return jnp.maximum(first, 0)
-
-    def largest(self) -> Lanes:
-        """Numbers of the largest ring of a finger: of its last one, or of either end's."""
-        tip = self.ring(self.count - 1)
-        return lanewise(jnp.maximum, tip, self.ring(0)) if self.layout.tapered else tip
-
-    def start(self, link_acc: Lanes, vel: Lanes, frame: Lanes, base: Lanes) -> None:
-        """Empties the slots; stores what belongs to the palm."""
-        for row in range(self.contacts.layout.slots.rows):
-            self.contacts.clear(row)
+    def clear(self) -> None:
+        """Empties the slots, before the step's contacts are found."""
+        for slot_row in range(self.contacts.layout.slots.rows):
+            self.contacts.clear(slot_row)
         friction_memory.clear(self.step)
-        self.write(Search.fastest, zeros((), self.like))
-        self._side(0, link_acc, vel, frame, base)
-        self.write(Search.end, lanewise(above, base, frame, frame, self.ring(self.ring_at(0))), 0)
-
-    def link(self, i: Any, link_acc: Lanes, vel: Lanes, frame: Lanes, origin: Lanes) -> None:
-        before = self.read(Search.frame, i)
-        self._side(i + 1, link_acc, vel, frame, origin)
-        numbers = self.ring(self.ring_at(i + 1))
-        self.write(Search.end, lanewise(above, origin, before, frame, numbers), i + 1)
-        size = self.read(Search.fastest), vel, self.palm_vel, origin, self.ring(0)
-        self.write(Search.fastest, lanewise(_faster, *size))
-
-    def _side(self, row: Any, link_acc: Lanes, vel: Lanes, frame: Lanes, joint: Lanes) -> None:
-        self.sides.put(Side.link_acc, link_acc, row)
-        self.sides.put(Side.vel, vel, row)
-        self.write(Search.frame, frame, row)
-        self.write(Search.joint, joint, row)
-
-    def _copy_line(self, pairing: FingerPairing, i: Any) -> None:
-        """Copies a segment of the other finger's centre line."""
-        self.write(Search.other, pairing.swap(self.read(Search.line, i)), i)
-
-    def side_of(self, name: Field, row: Any, lane: jax.Array | None = None) -> Lanes:
-        """A field of `rows.Side` of bodies, of the lanes' own fingers or those of other lanes."""
-        if lane is None and not jnp.ndim(row):
-            return self.sides.table.read(name, row)
-        return self._gathered(self.sides.table, name, row, lane)
-
-    def _lines(self) -> None:
-        """Ends the centre lines at the tips' rings; stores their segments."""
-        tip = self.ring(self.count - 1)
-        place = (
-            self.read(Search.joint, self.layout.links),
-            self.read(Search.frame, self.layout.links),
-        )
-        self.write(Search.end, lanewise(ring_centre, *place, tip), self.layout.links + 1)
-
-        def segment(row: Any) -> None:
-            ends = self.read(Search.end, row), self.read(Search.end, row + 1)
-            self.write(Search.line, lanewise(_line, *ends), row)
-
-        each(self.layout.links + 1, segment)
-
-    def body(self, item: Any) -> tuple[Any, Lanes, Lanes, Lanes]:
-        """A ring's link, its numbers, the link's frame and the ring's centre."""
-        row = jax.lax.div(item, jnp.full_like(item, self.layout.rings_per_link)) + 1
-        frame = self.read(Search.frame, row)
-        numbers = self.ring(item)
-        return (
-            row,
-            numbers,
-            frame,
-            lanewise(ring_centre, self.read(Search.joint, row), frame, numbers),
-        )
 
     def find(self) -> None:
+        """Gives a slot to each contact of this step, when all links are stored."""
         scene = self.layout.scene
+        fingers = self.fingers
         if self.hull:
-            self._lines()
+            fingers.end_lines()
         if self.palm is not None:
             self._each_ring(first_on_palm(self.layout.links) - 1, self._on_palm)
         if touches_itself(scene):
@@ -195,20 +88,21 @@ class SelfCollision:
         if not scene.effects.finger_finger:
             return
 
-        def pairing(row: jax.Array, x: jax.Array) -> jax.Array:
-            pairing = self.contacts.pairing(row)
+        def pairing(slot_row: jax.Array, x: jax.Array) -> jax.Array:
+            pairing = self.contacts.pairing(slot_row)
             other = jax.lax.div(pairing.lane, jnp.int32(self.layout.block))
             owner = (self.block.finger < other) & (other < self.layout.num_fingers)
             if self.hull and not self.contacts.layout.slots.gathers:
-                RingPairs(self, row, pairing, owner).find()
+                RingPairs(self, slot_row, pairing, owner).find()
                 return x
             if self.hull:
                 # The segments of the other finger's centre line.
                 each(self.layout.links + 1, partial(self._copy_line, pairing))
-                size = lanewise(_stacked, self.reach(self.largest()), self.read(Search.fastest))
-                self.write(Search.other_size, pairing.swap(size))
+                reach = fingers.reach(fingers.largest())
+                size = lanewise(_stacked, reach, fingers.read(Search.fastest))
+                fingers.write(Search.other_size, pairing.swap(size))
             search = self._on_finger if self.hull else self._on_spheres
-            self._each_ring(0, lambda *ring: search(row, pairing, owner, *ring))
+            self._each_ring(0, lambda *ring: search(slot_row, pairing, owner, *ring))
             return x
 
         jax.lax.fori_loop(
@@ -221,7 +115,7 @@ class SelfCollision:
     def _each_ring(self, link: int, search: Callable) -> None:
         """Runs search(item, lanes that have it) for all rings from a link on, dealt to lanes."""
         first = link * self.layout.rings_per_link
-        count = self.count - first
+        count = self.fingers.count - first
 
         def ring(k: Any) -> None:
             item, mine = self.block.dealt(count, k)
@@ -229,51 +123,11 @@ class SelfCollision:
 
         each(self.block.rounds(count), ring)
 
-    # As a grasp begins
+    def _copy_line(self, pairing: FingerPairing, i: Any) -> None:
+        """Copies a segment of the other finger's centre line."""
+        self.fingers.write(Search.other, pairing.swap(self.fingers.read(Search.line, i)), i)
 
-    def deepest(self, contacts: ContactList) -> Lanes:
-        """The largest overlap of fingers with one another and with the palm [m], or zero.
-
-        Contacts are those that were found. See `engines.depths.depth_between` and `depth_in_palm`.
-        """
-        depth = zeros((), self.like)
-        if self.palm is not None:
-            depth = contacts.deepest_in_palm(depth)
-        if not self.layout.scene.effects.finger_finger:
-            return depth
-
-        def pairing(number: Any, depth: Lanes) -> Lanes:
-            partner = FingerPairing(self.block, number + 1, self.like.dtype, with_itself=False)
-            return self._deepest_of_pair(partner, depth)
-
-        return loop(self.block.fingers - 1, pairing, depth, self.block.size)
-
-    def _deepest_of_pair(self, pairing: FingerPairing, depth: Lanes) -> Lanes:
-        """The larger of a depth and those of the spheres around two fingers' links."""
-        fingers = self.layout.num_fingers
-        other = jax.lax.div(pairing.lane, jnp.int32(self.layout.block))
-        both = lanes([(self.block.finger < fingers) & (other < fingers)], (), wide=True)
-
-        def with_other(j: Any, depth: Lanes) -> Lanes:
-            theirs = pairing.swap(self._sphere(j))
-            deeper = lambda i, d: lanewise(_deeper, d, both, self._sphere(i), theirs)  # noqa: E731
-            return loop(self.layout.links, deeper, depth, self.block.size)
-
-        return loop(self.layout.links, with_other, depth, self.block.size)
-
-    def _sphere(self, i: Any) -> Lanes:
-        """Middle and radius [m] of the sphere around a link, as high as its section, (4,)."""
-        where = self.read(Search.joint, i + 1), self.read(Search.frame, i + 1)
-        centre = self.step.hand.read(Hand.centre, i)
-        if self.layout.grows:
-            centre = lanewise(_raised, centre, self.step.growth_of(i * self.layout.rings_per_link))
-        return lanewise(_sphere, *where, centre)
-
-    # Contacts
-
-    def reach(self, numbers: Lanes) -> Lanes:
-        """How far a ring reaches from its centre [m]."""
-        return lanewise(touch.ring_reach, numbers)
+    # Which rings are close
 
     def gap(self, speed: Lanes) -> jax.Array:
         """Largest gap that bodies of this speed to each other may close in this step [m]."""
@@ -303,6 +157,8 @@ class SelfCollision:
         close = near & (faced.gap.lane < self.gap(speed))
         any_of(close, lambda: add(close))
 
+    # What is stored of a contact
+
     def candidate(
         self,
         place: Place,
@@ -315,7 +171,9 @@ class SelfCollision:
         """Fields of a contact of a link with another body, see `ContactList.create`.
 
         Args:
-          row: The link.
+          place: Where it is.
+          cone: Its friction cone.
+          row: The link, 1 for the first one.
           mine: Its acceleration and velocity, see `moves`; `theirs`: those of the other body.
           held: What the contact holds of friction, (3,), or nothing.
         """
@@ -326,20 +184,18 @@ class SelfCollision:
             jar = lanewise(_with_held, jar, place, cone, g)
         return fields_of(place, jar) | {Slot.side: self._number(row)}
 
-    def moves(self, row: Any, lane: jax.Array | None = None) -> list[Lanes]:
-        """Accelerations and velocities of links; arguments as `read`."""
-        return [self.side_of(name, row, lane) for name in (Side.link_acc, Side.vel)]
-
     def of_rows(
         self, read: Callable, row: jax.Array, which: jax.Array, pairing: FingerPairing | None
     ) -> Any:
-        """read(row of each lane, lane of the finger that has it), a tree of lanes.
+        """Returns read(row of each lane, lane of the finger that has it), a tree of lanes.
 
         Vectors gather number by number: there the rows of the lanes `which`, of which there are
         few, are read one after the other. Other lanes get what one of these has.
 
         Args:
-          row: int32, shape (lane,).
+          read: Reads, such as `FingerShapes.segment`.
+          row: Rows of bodies, int32, shape (lane,).
+          which: Lanes that need them, bool, shape (lane,).
           pairing: Whose partner has the rows; None for the lanes' own fingers.
         """
         if self.contacts.layout.slots.gathers:
@@ -364,6 +220,8 @@ class SelfCollision:
         gathered = rebuild(jax.lax.while_loop(lambda c: c[0] >= 0, step, start)[2:])
         return gathered if pairing is None else pairing.swap(gathered)
 
+    # Each kind of contact
+
     def _number(self, value: Any) -> Lanes:
         return lanes([self.like + jnp.asarray(value, self.like.dtype)], (1, 1), wide=True)
 
@@ -380,22 +238,23 @@ class SelfCollision:
         any_of(which, lambda: self.contacts.append(0, which, candidate))
 
     def _on_palm(self, item: Any, mine: jax.Array) -> None:
-        row, numbers, frame, centre = self.body(item)
+        fingers = self.fingers
+        row, numbers, frame, centre = fingers.body(item)
 
         def look(point: Lanes) -> tuple[Lanes, Lanes]:
             return lanewise(palm_distance, point, self.palm)
 
         field = look(centre)
         place = lanes([self.like + jnp.asarray(row, self.like.dtype)], (), wide=True)
-        sizes = self.step.hand.read(Hand.offset, 0), self.ring(0)
+        sizes = self.step.hand.read(Hand.offset, 0), fingers.ring(0)
         mine = mine & (lanewise(free_of_palm, place, numbers, *sizes).lane > 0)
         near = self._near_palm(field[0], numbers)
 
         def add(place: Place) -> None:
             palm = jnp.zeros_like(jnp.asarray(row))
             cone = self.contacts.cone_of_row(0)
-            theirs = self.moves(palm)
-            candidate = self.candidate(place, cone, row, self.moves(row), theirs, [])
+            theirs = fingers.moves(palm)
+            candidate = self.candidate(place, cone, row, fingers.moves(row), theirs, [])
             self._alone(candidate, palm, item, mine)
 
         def enter() -> None:
@@ -404,7 +263,7 @@ class SelfCollision:
             def add_ring(_: jax.Array) -> None:
                 add(lanewise(touch.ring_place, numbers, frame, centre, faced))
 
-            self.if_close(mine, faced, self.read(Search.fastest), add_ring)
+            self.if_close(mine, faced, fingers.read(Search.fastest), add_ring)
 
         def enter_ball() -> None:
             add(lanewise(touch.ball_on_field, numbers, centre, *field))
@@ -412,80 +271,62 @@ class SelfCollision:
         any_of(mine & near, enter if self.hull else enter_ball)
 
     def _near_palm(self, distance: Lanes, numbers: Lanes) -> jax.Array:
+        fingers = self.fingers
         size = lanewise(jnp.maximum, distance, zeros((), self.like)).lane
         none = zeros((), self.like)
-        return self.near(size * size, self.reach(numbers), none, self.read(Search.fastest))
+        square = size * size
+        return self.near(square, fingers.reach(numbers), none, fingers.read(Search.fastest))
 
     def _on_itself(self, item: Any, mine: jax.Array) -> None:
-        row, numbers, frame, centre = self.body(item)
+        fingers = self.fingers
+        row, numbers, frame, centre = fingers.body(item)
         square, other, t = self.nearest(Search.line, centre, item)
-        theirs = self.largest() if self.layout.tapered else numbers
-        reaches = self.reach(numbers), self.reach(theirs)
-        near = mine & self.near(square, *reaches, self.read(Search.fastest))
+        theirs = fingers.largest() if self.layout.tapered else numbers
+        reaches = fingers.reach(numbers), fingers.reach(theirs)
+        near = mine & self.near(square, *reaches, fingers.read(Search.fastest))
 
         def enter() -> None:
-            segment, moves = self.of_rows(self.segment, other, near, None)
-            faced = self.facing(numbers, frame, centre, segment, other, t)
+            segment, moves = self.of_rows(fingers.segment, other, near, None)
+            faced = fingers.facing(numbers, frame, centre, segment, other, t)
 
             def add(close: jax.Array) -> None:
                 place = self.place(numbers, frame, centre, faced)
                 held = friction_memory.held_by_pairing(self.step, self.contacts, 0)
                 candidate = self.candidate(
-                    place, self.contacts.cone_of_row(1), row, self.moves(row), moves, held
+                    place, self.contacts.cone_of_row(1), row, fingers.moves(row), moves, held
                 )
                 self._alone(candidate, other, item, close)
 
-            self.if_close(near, faced, self.read(Search.fastest), add)
+            self.if_close(near, faced, fingers.read(Search.fastest), add)
 
         any_of(near, enter)
 
-    def _end(self, item: Any) -> jax.Array:
-        """The last place along a finger [links] that one of its rings touches."""
-        tip = self.ring(self.count - 1)
-        return self._along(item) - lanewise(arc, tip, self.largest()).lane
-
-    def _rows_back(self, item: Any) -> jax.Array:
-        """Segments that begin before the last place of any lane's `_end`, or more, a scalar."""
-        return jnp.max((self._end(item) + 1.5).astype(jnp.int32))
-
-    def last_of(self, item: Any, row: Any) -> jax.Array:
-        """The last place on a segment, 0 to 1, that rings of the same finger touch."""
-        start = self.like + jnp.asarray(row).astype(self.like.dtype) - 0.5
-        length = jnp.where(jnp.equal(row, self.layout.links), self.like + RING_TIP, 1.0)
-        return jnp.minimum((self._end(item) - start) / length, 1.0)
-
-    def _along(self, item: Any) -> jax.Array:
-        """Place of a ring along the finger, in links from its base."""
-        item = jnp.zeros_like(self.block.column) + item
-        k = jnp.full_like(item, self.layout.rings_per_link)
-        link = jax.lax.div(item, k)
-        number = jax.lax.rem(item, k)
-        places = ring_places(self.layout.links, self.layout.rings_per_link)
-        part = (number.astype(self.like.dtype) + 0.5) / self.layout.rings_per_link
-        last = jnp.where(number == k - 1, places[-1, -1], 0.5 * part)
-        along = jnp.where(link == self.layout.links - 1, last, part)
-        return link.astype(self.like.dtype) + (0.5 + along)
-
     def _on_finger(
-        self, row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
+        self, slot_row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
     ) -> None:
-        link, numbers, frame, centre = self.body(item)
+        fingers = self.fingers
+        link, numbers, frame, centre = fingers.body(item)
         square, other, t = self.nearest(Search.other, centre)
-        theirs = self.read(Search.other_size)
-        speed = lanewise(jnp.add, self.read(Search.fastest), theirs[1])
-        near = owner & mine & self.near(square, self.reach(numbers), theirs[0], speed)
+        theirs = fingers.read(Search.other_size)
+        speed = lanewise(jnp.add, fingers.read(Search.fastest), theirs[1])
+        near = owner & mine & self.near(square, fingers.reach(numbers), theirs[0], speed)
 
         def enter() -> None:
-            segment, moves = self.of_rows(self.segment, other, near, pairing)
-            faced = self.facing(numbers, frame, centre, segment, other, t)
+            segment, moves = self.of_rows(fingers.segment, other, near, pairing)
+            faced = fingers.facing(numbers, frame, centre, segment, other, t)
 
             def add(close: jax.Array) -> None:
                 place = self.place(numbers, frame, centre, faced)
-                held = friction_memory.held_by_pairing(self.step, self.contacts, row)
+                held = friction_memory.held_by_pairing(self.step, self.contacts, slot_row)
                 candidate = self.candidate(
-                    place, self.contacts.cone_of_row(row), link, self.moves(link), moves, held
+                    place,
+                    self.contacts.cone_of_row(slot_row),
+                    link,
+                    fingers.moves(link),
+                    moves,
+                    held,
                 )
-                self.enter(row, close, owner, candidate, other, item)
+                self.enter(slot_row, close, owner, candidate, other, item)
 
             self.if_close(near, faced, speed, add)
 
@@ -493,7 +334,7 @@ class SelfCollision:
 
     def enter(
         self,
-        row: Any,
+        slot_row: Any,
         near: jax.Array,
         owner: jax.Array,
         contact: dict[str, Lanes],
@@ -504,6 +345,7 @@ class SelfCollision:
         """Gives contacts of two fingers a slot.
 
         Args:
+          slot_row: Their row of slots.
           near: Lanes that may have found a contact.
           owner: Lanes of the rings' fingers.
           contact: See `candidate`.
@@ -529,14 +371,19 @@ class SelfCollision:
         )
         fields = (mine, theirs) if second is None else (theirs, mine)
         finder = owner if second is None else second
-        any_of(which, lambda: self.contacts.enter(row, which, finder, *fields, alike))
+        any_of(which, lambda: self.contacts.enter(slot_row, which, finder, *fields, alike))
 
     def nearest(self, name: Field, centre: Lanes, itself: Any = None) -> tuple:
-        """The nearest place of a centre line: squared distance, segment, and where along it.
+        """The nearest place of a centre line.
 
         Args:
           name: `Search.line`, the finger's own, or `Search.other`.
+          centre: The lanes' rings' centres [m], (3, ...).
           itself: The ring on the finger's own line.
+
+        Returns:
+          Its squared distance [m^2], its segment's link, int32, and where along the segment it is,
+          0 to 1, shape (lane,) each.
         """
         last = self.layout.links
 
@@ -554,75 +401,54 @@ class SelfCollision:
 
         def nearer(row: Any, best: Lanes) -> Lanes:
             number = self.like + jnp.asarray(row).astype(self.like.dtype)
-            end = self.like + 1.0 if itself is None else self.last_of(itself, row)
+            end = self.like + 1.0 if itself is None else self.fingers.last_of(itself, row)
             place, end = (lanes([v], (), wide=True) for v in (number, end))
-            return lanewise(compare, self.read(name, row), centre, best, place, end)
+            return lanewise(compare, self.fingers.read(name, row), centre, best, place, end)
 
         best = lanes([self.like + 1.0, self.like, self.like], (3,), wide=True)
         first = int(itself is not None)  # a finger's half link at the palm is the palm's
         count: Any = last + 1 - first
         if itself is not None and not self.contacts.layout.slots.gathers:
-            count = jnp.clip(self._rows_back(itself), 0, count)
+            count = jnp.clip(self.fingers.rows_back(itself), 0, count)
         best = loop(count, lambda k, b: nearer(k + first, b), best, self.block.size)
         square, number, t = (best[k].lane for k in range(3))
         return square, number.astype(jnp.int32), t
 
-    def segment(self, row: Any, lane: jax.Array | None = None) -> tuple[tuple, list[Lanes]]:
-        """Segments' ends, frames and sections, and their links' `moves`; arguments as `read`."""
-        frames = tuple(self.read(Search.frame, r, lane) for r in neighbours(row, self.layout.links))
-        ends = self.read(Search.end, row, lane), self.read(Search.end, row + 1, lane)
-        return (ends, frames, self.ring(self.ring_at(row + 1), lane)), self.moves(row, lane)
-
-    def facing(
-        self, numbers: Lanes, frame: Lanes, centre: Lanes, segment: tuple, row: jax.Array, t: Any
-    ) -> Facing:
-        """How the lanes' rings face segments; `rings.facing_line`.
+    def place(self, numbers: Lanes, frame: Lanes, centre: Lanes, facing: Facing) -> Place:
+        """Contacts of rings with what they face; `rings.place`.
 
         Args:
-          segment: Their ends, frames and sections, see `segment`.
-          row: Their links.
+          numbers: The rings' numbers; `frame`: their links' frames as columns, (3, 3, ...);
+            `centre`: their centres [m], (3, ...).
+          facing: How they face it.
         """
-        last = lanes(
-            [jnp.where(row == self.layout.links, self.like + 1.0, self.like)], (), wide=True
-        )
-        where = lanes([t], (), wide=True)
-        return lanewise(facing_line, numbers, frame, centre, (*segment, last), where)
-
-    def place(self, numbers: Lanes, frame: Lanes, centre: Lanes, facing: Facing) -> Place:
-        """Contacts of rings with what they face; `rings.place`."""
         return lanewise(place_of, numbers, frame, centre, facing)
 
-    # Spheres
-
     def _on_spheres(
-        self, row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
+        self, slot_row: Any, pairing: FingerPairing, owner: jax.Array, item: Any, mine: Any
     ) -> None:
         """A sphere of the finger that comes first, with all of the other one's."""
-        link, numbers, _, centre = self.body(item)
+        fingers = self.fingers
+        link, numbers, _, centre = fingers.body(item)
         apart = self.layout.rings_per_link
 
         def with_other(j: Any) -> None:
-            theirs = pairing.swap(self.body(j)[1:])
+            theirs = pairing.swap(fingers.body(j)[1:])
             place = lanewise(balls, numbers, centre, theirs[0], theirs[2])
             near = owner & mine & (place.gap.lane < 0)
 
             def enter() -> None:
                 other = jax.lax.div(j, jnp.full_like(j, apart)) + 1
-                moves = pairing.swap(self.moves(other))
+                moves = pairing.swap(fingers.moves(other))
                 candidate = self.candidate(
-                    place, self.contacts.cone_of_row(row), link, self.moves(link), moves, []
+                    place, self.contacts.cone_of_row(slot_row), link, fingers.moves(link), moves, []
                 )
-                number = item + self.count * j
-                self.enter(row, near, owner, candidate, other, number)
+                number = item + fingers.count * j
+                self.enter(slot_row, near, owner, candidate, other, number)
 
             any_of(near, enter)
 
-        each(self.count, with_other)
-
-
-def neighbours(row: jax.Array, links: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The link before each of some links, itself, and the next one; the ends are their own."""
-    return jnp.maximum(row - 1, 0), row, jnp.minimum(row + 1, links)
+        each(fingers.count, with_other)
 
 
 def closed(timestep, speed):
@@ -642,40 +468,6 @@ def free_of_palm(row, numbers, offset, first):
     return jnp.where(beyond_base(along, 2.0 * first[5]), 1.0, 0.0)
 
 
-def arc(tip, largest):
-    """Least distance along a finger at which it touches itself, in links."""
-    heights = APART_HEIGHTS * 2.0 * Ring.of(largest).half[2]
-    link = Ring.of(tip).half[0] / RING_TIP
-    return jnp.maximum(APART_LINKS, heights / link)
-
-
-def _sphere(origin, frame, centre):
-    return jnp.concatenate([origin + apply_columns(frame, centre), centre[2:]])
-
-
-def _raised(centre, factors):
-    return jnp.stack([centre[0], centre[1], factors[0] * centre[2]])
-
-
-def _deeper(depth, both, mine, theirs):
-    away = mine[:3] - theirs[:3]
-    overlap = mine[3] + theirs[3] - jnp.sqrt(dot(away, away))
-    return jnp.maximum(depth, jnp.where(both, overlap, 0.0))
-
-
-def _line(start, end):
-    along = end - start
-    return jnp.concatenate([start, along, (1.0 / dot(along, along))[None]])
-
-
-def _faster(most, vel, palm, origin, numbers):
-    """Bound of the speed of a finger's surface relative to the palm [m/s]."""
-    moving = vel - palm
-    speed = moving[3:] + cross(moving[:3], origin)
-    turning = jnp.sqrt(dot(moving[:3], moving[:3])) * SURFACE_RADIUS * numbers[5]
-    return jnp.maximum(most, jnp.sqrt(dot(speed, speed)) + turning)
-
-
 def _stacked(*numbers):
     return jnp.stack(numbers)
 
@@ -686,13 +478,3 @@ def _differences(mine: list, theirs: list) -> list:
 
 def _with_held(jar, place, cone, held_friction):
     return with_held(jar, place, cone, held_friction[:, None])
-
-
-def each(count: int, body: Callable[[Any], None]) -> None:
-    """Runs body(item), which stores something, for all items."""
-
-    def step(k: jax.Array, x: jax.Array) -> jax.Array:
-        body(k)
-        return x
-
-    jax.lax.fori_loop(0, count, step, jnp.int32(0))

@@ -228,20 +228,20 @@ class Sides:
         assert cells.filled is not None
         filled = cells.filled
 
-        def of_row(row: Any, x: jax.Array) -> jax.Array:
+        def of_row(slot_row: Any, x: jax.Array) -> jax.Array:
             def slot_wrench(k: jax.Array, x: jax.Array) -> jax.Array:
-                slot = layout.slots.slot(cells, row, k)
+                slot = layout.slots.slot(cells, slot_row, k)
                 # Lanes without a component read what nobody wrote, which may be no number.
                 more = jnp.where(self.block.mate < 6, parts.get(name, slot.source), 0.0)
                 pushes = {Slot.side: more}
                 if layout.with_itself:
-                    pushes[Slot.other_side] = jnp.where(jnp.equal(row, 0), -more, 0.0)
+                    pushes[Slot.other_side] = jnp.where(jnp.equal(slot_row, 0), -more, 0.0)
                 for field, push in pushes.items():
                     side = contacts.read(field, slot).lane.astype(jnp.int32)
                     parts.put(Side.wrench, parts.get(Side.wrench, side) + push, side)
                 return x
 
-            return jax.lax.fori_loop(0, jnp.max(filled.of(row)), slot_wrench, x)
+            return jax.lax.fori_loop(0, jnp.max(filled.of(slot_row)), slot_wrench, x)
 
         jax.lax.fori_loop(0, layout.slots.rows, of_row, jnp.int32(0))
 

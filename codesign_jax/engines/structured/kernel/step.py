@@ -1,4 +1,17 @@
-"""One time step of a block of worlds inside the kernel, and which worlds may go on."""
+"""One time step of a block of worlds inside the kernel, and which worlds may go on.
+
+`Step.advance` is a step, in this order:
+
+1. `Step.assemble` reads the state, and finds bodies, forces and contacts: palm and object first
+   (`palm_and_object`), then link by link to the tips (`link_forces`), with each link's contacts
+   with object and table (`SdfCollision`); then those of the hand with itself (`SelfCollision`).
+2. `Newton.solve` finds the accelerations at which all forces balance.
+3. `record.write` writes the contacts' forces, if they are recorded.
+4. `semi_implicit_euler` moves the worlds that go on.
+
+What a part leaves for the next ones is in memory, by link (`rows.Scratch`) or by contact
+(`rows.Contact`), or it is returned: `Assembly`.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,6 +27,7 @@ from codesign_jax.engines.structured.kernel import (
     record,
     step_contacts,
 )
+from codesign_jax.engines.structured.kernel.finger_shapes import FingerShapes
 from codesign_jax.engines.structured.kernel.memory import BoundTable, anywhere, loop, zeros
 from codesign_jax.engines.structured.kernel.newton import Convergence, Limits, Newton
 from codesign_jax.engines.structured.kernel.objects import WorldObject
@@ -48,7 +62,7 @@ class Assembly(NamedTuple):
     bodies: dict[str, Any]
     world_object: WorldObject  # The object of each lane's world
     contacts: StepContacts  # Those that were found
-    search: SelfCollision | None  # What found those of the hand with itself; None without
+    fingers: FingerShapes | None  # Where fingers are; None without contacts of the hand with itself
     fast: jax.Array  # Whether a link turns by more than `inertia.LARGEST_TURN`, bool, a scalar
     centre: Lanes  # The hand's centre from the object's [m], shape (3, 1, world)
 
@@ -134,8 +148,8 @@ class Step(StepMemory):
         state = assembly.state
         contacts = assembly.contacts
         depths = [c.deepest().lane for c in contacts.field_contacts.values()]
-        if assembly.search and contacts.self_contacts:
-            depths.append(assembly.search.deepest(contacts.self_contacts).lane)
+        if assembly.fingers and contacts.self_contacts:
+            depths.append(assembly.fingers.deepest(contacts.self_contacts).lane)
         deepest = self.like
         for depth in depths:
             deepest = jnp.maximum(deepest, depth)
@@ -207,10 +221,12 @@ class Step(StepMemory):
         origin, frame, vel, _, link_acc, _ = start
         if layout.scene.effects.air_mass:
             pressure = chambers.end_pressures(self, pressure)
-        search = None
+        fingers = search = None
         if contacts.self_contacts and contacts.sides:
-            search = SelfCollision(self, contacts.self_contacts, contacts.sides, bodies)
-            search.start(link_acc, vel, frame, origin)
+            fingers = FingerShapes(self, contacts.sides, bodies["vel"])
+            search = SelfCollision(fingers, contacts.self_contacts, bodies)
+            search.clear()
+            fingers.start(link_acc, vel, frame, origin)
         fields = SdfCollision(self, contacts, bodies, world_object)
         zero_acc = zeros((6,), like)
 
@@ -233,8 +249,8 @@ class Step(StepMemory):
             weight = self.hand.read(Hand.centre_weight, i + 1)
             middle = lanewise(add_weighted, middle, centre, weight)
             fields.of_link(i, chain)
-            if search:
-                search.link(i, chain[4], chain[2], chain[1], chain[0])
+            if fingers:
+                fingers.link(i, chain[4], chain[2], chain[1], chain[0])
             return (*chain, middle, least)
 
         start = (*start, lanewise(jnp.ones_like, start[0][0]))
@@ -244,14 +260,14 @@ class Step(StepMemory):
         jax.lax.cond(fast, lambda: self._carry_momenta(state, start[:3]), lambda: None)
         if search:
             search.find()
-        if search and layout.team > 1:
-            fields.of_rings(search)
+        if fingers and layout.team > 1:
+            fields.of_rings(fingers)
         counted = contacts.counted()
         fields.of_palm_and_object(state)
         count = layout.num_fingers * layout.links
         middle = self.block.sum(middle)
         centre = lanewise(lambda c: c / count, middle)
-        return Assembly(state, bodies, world_object, counted, search, fast, centre)
+        return Assembly(state, bodies, world_object, counted, fingers, fast, centre)
 
 
 def add_weighted(total, centre, weight):

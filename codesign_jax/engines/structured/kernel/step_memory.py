@@ -89,6 +89,7 @@ class KernelLayout:
 
     @property
     def tapered(self) -> bool:
+        """Whether sections of a finger differ from its base to its tip."""
         return self.scene.hand.section.tapered
 
     @property

@@ -206,6 +206,24 @@ class Step(StepMemory):
         vel, bias, link_acc = (lanewise(jnp.add, v, wide) for v in palm)
         return origin, frame, vel, bias, link_acc, weight
 
+    def _store_link(self, i: Any, stored: dict[str, Lanes], mass: Lanes) -> None:
+        """Stores a link for the solver, whose steps begin at none.
+
+        Args:
+          i: Number of the link.
+          stored: What `link_forces` leaves to the solver, by row of `rows.Scratch`.
+          mass: The link's mass [kg].
+        """
+        none = zeros((6,), self.like)
+        steps = {"step_acc": zeros((self.layout.axes,), self.like), "step_link_acc": none}
+        if Scratch.chord_link_acc in self.scratch:
+            steps |= {Scratch.chord_link_acc: none}
+        every = stored | steps
+        if self.layout.team > 1:
+            every = team_rows(every, (mass, stored["body_centre"], stored["tensor"]))
+        for name, value in every.items():
+            self.write(name, value, i)
+
     def _forward(
         self,
         state: dict,
@@ -214,9 +232,13 @@ class Step(StepMemory):
         world_object: WorldObject,
         contacts: StepContacts,
     ) -> Assembly:
-        """Bodies, forces and contacts from the palm to the tips, left in the scratch table."""
+        """Bodies, forces and contacts from the palm to the tips, left in the scratch table.
+
+        From link to link go its motion (`chain`), the sum of the links' weighted centres (`middle`)
+        and the least share of velocity products of any link (`least`), see
+        `inertia.share_of_products`.
+        """
         layout = self.layout
-        like = self.like
         start = self._bases(bodies)
         origin, frame, vel, _, link_acc, _ = start
         if layout.scene.effects.air_mass:
@@ -228,7 +250,6 @@ class Step(StepMemory):
             search.clear()
             fingers.start(link_acc, vel, frame, origin)
         fields = SdfCollision(self, contacts, bodies, world_object)
-        zero_acc = zeros((6,), like)
 
         def link(i: Any, carry: tuple) -> tuple:
             *chain, middle, least = carry
@@ -238,16 +259,9 @@ class Step(StepMemory):
             constants = self.link_constants(i)
             chain, stored = lanewise(run, tuple(chain), constants, joint)
             least = lanewise(jnp.minimum, least, stored.pop("share"))
-            centre = stored["body_centre"]
-            stored |= {"step_acc": zeros((layout.axes,), like), "step_link_acc": zero_acc}
-            if Scratch.chord_link_acc in self.scratch:
-                stored |= {Scratch.chord_link_acc: zero_acc}
-            if layout.team > 1:
-                stored = team_rows(stored, (constants["mass"], centre, stored["tensor"]))
-            for name, value in stored.items():
-                self.write(name, value, i)
+            self._store_link(i, stored, constants["mass"])
             weight = self.hand.read(Hand.centre_weight, i + 1)
-            middle = lanewise(add_weighted, middle, centre, weight)
+            middle = lanewise(add_weighted, middle, stored["body_centre"], weight)
             fields.of_link(i, chain)
             if fingers:
                 fingers.link(i, chain[4], chain[2], chain[1], chain[0])

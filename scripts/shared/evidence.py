@@ -78,7 +78,7 @@ SIMULATION = (
 )
 """Files that decide what a grasp does and how fast it is computed."""
 SAME = {
-    "2de29b66": "e3ad8e40",  # one contact list; a step's contacts are values that are handed on
+    "cb65658f": "e3ad8e40",  # one contact list; a step's contacts are values that are handed on
 }
 """Digests of code that was rearranged, with the digest of the code before.
 

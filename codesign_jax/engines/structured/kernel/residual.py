@@ -9,12 +9,12 @@ as in `lanewise`, made of the functions that the forward pass calls; what contac
 
 from typing import Any, NamedTuple
 
-from codesign_jax.engines.structured.kernel.problem import make_body
-from codesign_jax.engines.structured.kernel.step import (
+from codesign_jax.engines.structured.kernel.body_motion import (
     carried_momentum,
     link_forces,
     palm_and_object,
 )
+from codesign_jax.engines.structured.kernel.problem import make_body
 from codesign_jax.engines.structured.lanes import dot
 from codesign_jax.engines.structured.laws.kinematics import next_acceleration, palm_acceleration
 from codesign_jax.scene import Scene

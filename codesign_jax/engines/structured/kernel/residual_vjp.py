@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from codesign_jax.engines.structured.kernel import residual
+from codesign_jax.engines.structured.kernel.body_motion import WRIST, bases_before
 from codesign_jax.engines.structured.kernel.cotangents import CotangentTables, plus, pull
 from codesign_jax.engines.structured.kernel.kinds import BodyMotion
 from codesign_jax.engines.structured.kernel.memory import choose, loop, zeros
@@ -20,7 +21,7 @@ from codesign_jax.engines.structured.kernel.rows import (
     Hand,
     Virtual,
 )
-from codesign_jax.engines.structured.kernel.step import WRIST, Assembly, Step, bases_before
+from codesign_jax.engines.structured.kernel.step import Assembly, Step
 from codesign_jax.engines.structured.kernel.step_memory import FINGER_CONSTANTS, LINK_CONSTANTS
 from codesign_jax.engines.structured.lanes import apply_columns
 from codesign_jax.engines.structured.lanewise import Lanes, lanes, lanewise

@@ -60,7 +60,7 @@ class SdfCollision:
         Args:
           step: The step's memory.
           contacts: The step's contacts, of which it enters those with fields.
-          bodies: What `step.palm_and_object` returns.
+          bodies: What `body_motion.palm_and_object` returns.
           world_object: The object of each lane's world.
         """
         self.step = step

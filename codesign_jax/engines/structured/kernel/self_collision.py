@@ -56,7 +56,7 @@ class SelfCollision:
     """
 
     def __init__(self, fingers: FingerShapes, self_contacts: ContactList, bodies: dict[str, Any]):
-        """Prepares the search; bodies: what `step.palm_and_object` returns."""
+        """Prepares the search; bodies: what `body_motion.palm_and_object` returns."""
         step = fingers.step
         self.step = step
         self.fingers = fingers

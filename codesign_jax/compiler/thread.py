@@ -138,9 +138,10 @@ class ThreadWriter(Writer):
     def divide(self, a: Value, b: Value) -> Value:
         if a.kind == "f64":
             return super().divide(a, b)
-        self.declared.add("declare float @llvm.nvvm.div.full(float, float)")
-        parts = f"{self.typed(a)}, {self.typed(b)}"
-        return Value("f32", a.wide or b.wide, self.emit(f"call float @llvm.nvvm.div.full({parts})"))
+        # Of 2 units in the last place, as `div.full`, but 0 for divisors beyond 2^126 [PTX ISA].
+        self.declared.add("declare float @llvm.nvvm.div.approx.f(float, float)")
+        text = self.emit(f"call float @llvm.nvvm.div.approx.f({self.typed(a)}, {self.typed(b)})")
+        return Value("f32", a.wide or b.wide, text)
 
     def square_root(self, x: Value) -> Value:
         return super().square_root(x) if x.kind == "f64" else self._approximate("sqrt", x)

@@ -161,6 +161,7 @@ def test_every_command_runs_at_a_small_size(example, workdir, monkeypatch):
     arguments = here_alone(example)
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]
+    Path("grasps.parquet").unlink(missing_ok=True)  # of another example; no data set is replaced
     assert cli.main([*arguments, *size.get(arguments[0], [])]) == 0
 
 

@@ -24,7 +24,8 @@ def pytest_configure(config):
     gc.set_threshold(50_000, 20, 20)
     if hasattr(config, "workerinput"):
         return
-    if config.option.markexpr.partition(" ")[0] not in AS_FOR_USERS:  # also of "slow and not gpu"
+    # The first word decides: "slow and not gpu" selects slow tests.
+    if config.option.markexpr.partition(" ")[0] not in AS_FOR_USERS:
         compile_flags.use()
     folder = tempfile.mkdtemp(prefix="codesign-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))

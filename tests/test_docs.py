@@ -161,7 +161,8 @@ def test_every_command_runs_at_a_small_size(example, workdir, monkeypatch):
     arguments = here_alone(example)
     if arguments[0] == "optimize" and "switch" in example:
         size["optimize"] = [*SMALL, "--fresh", "--episodes", "9"]
-    Path("grasps.parquet").unlink(missing_ok=True)  # of another example; no data set is replaced
+    # Two examples write this data set, and the command replaces none.
+    Path("grasps.parquet").unlink(missing_ok=True)
     assert cli.main([*arguments, *size.get(arguments[0], [])]) == 0
 
 

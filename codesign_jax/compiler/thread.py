@@ -138,7 +138,8 @@ class ThreadWriter(Writer):
     def divide(self, a: Value, b: Value) -> Value:
         if a.kind == "f64":
             return super().divide(a, b)
-        # Of 2 units in the last place, as `div.full`, but 0 for divisors beyond 2^126 [PTX ISA].
+        # Its error is 2 units in the last place, as that of `div.full`, which takes three more
+        # instructions; but the quotient is 0 for divisors beyond 2^126 (PTX ISA).
         self.declared.add("declare float @llvm.nvvm.div.approx.f(float, float)")
         text = self.emit(f"call float @llvm.nvvm.div.approx.f({self.typed(a)}, {self.typed(b)})")
         return Value("f32", a.wide or b.wide, text)

@@ -209,16 +209,14 @@ def in_equal_time(
 ) -> tuple[list[Searches], float]:
     """Searches of a seed each, for the default search's time, and that time [s].
 
-    Seed 0 runs once more at first: its programs are compiled and its worker has begun.
+    A search of seed 0 goes before them, and is not returned: in it the programs are compiled and
+    the workers begin.
     """
     seconds = seconds_of_default(make)
     searches = []
     for seed in (0, *range(seeds)):
         search = Searches(make(name, first=seed, seeds=1), pool, threads)
         start = time.monotonic()
-        search.round()
-        # The first round of the first seed compiles.
-        start = start if searches else time.monotonic()
         while time.monotonic() - start < seconds:
             search.round()
         print(f"seed {seed}: {len(search.units)} batches in {seconds:.1f} s", flush=True)

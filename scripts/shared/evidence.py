@@ -78,14 +78,14 @@ SIMULATION = (
 )
 """Files that decide what a grasp does and how fast it is computed."""
 SAME = {
-    # One contact list; a step's contacts are values that are handed on; and on GPUs an approximate
-    # division, with which 4 of 5,824 verdicts of recommended hands differ
+    # The contact list, and a step's contacts as values (the same operations in the kernels), and the
+    # approximate division of GPUs (4 of 5,824 verdicts of recommended hands differ on an H200)
     "db4b5492": "e3ad8e40",
 }
-"""Digests of code that computes the same as earlier code, with the digest of that.
+"""Digests of code that computes the same as earlier code, each with the digest of the earlier code.
 
-Its figures are those of the earlier code: `scripts.same_kernels` finds that the kernels are the
-same, or have the same operations in another order, or their verdicts were compared.
+Figures of the earlier code hold for it: `scripts.same_kernels` found the same kernels, or the same
+operations in another order, or a comparison of verdicts found no more than rounding changes.
 """
 BLOCK = re.compile(r"<!-- version:begin -->.*?<!-- version:end -->\n\n", re.S)
 
@@ -100,7 +100,7 @@ def version(root: Path = ROOT) -> str:
 def kernel(root: Path = ROOT) -> str:
     """Digest of the code and constants of a simulation, without comments and docstrings.
 
-    Of code that was rearranged it is that of the code before, see `SAME`.
+    Code that computes the same as earlier code has the digest of that code, see `SAME`.
     """
     digest = hashlib.sha256()
     for pattern in SIMULATION:
@@ -151,9 +151,9 @@ def _syntax(node: Any) -> Iterator[str]:
 
 
 def records(content: Any) -> list[dict[str, Any]]:
-    """What made a file's results: the outermost tables that name a commit."""
+    """What made a file's results: the outermost tables that name a commit, and their `parts`."""
     if isinstance(content, dict) and "commit" in content:
-        return [content]
+        return [content, *records(content.get("parts", []))]
     inner = content.values() if isinstance(content, dict) else content
     return [r for v in inner if isinstance(v, dict | list) for r in records(v)]
 

@@ -78,7 +78,7 @@ SIMULATION = (
 )
 """Files that decide what a grasp does and how fast it is computed."""
 SAME = {
-    # The contact list, and a step's contacts as values (the same operations in the kernels), and the
+    # The contact list and a step's contacts as values (the same operations in the kernels), and the
     # approximate division of GPUs (4 of 5,824 verdicts of recommended hands differ on an H200)
     "db4b5492": "e3ad8e40",
 }
